@@ -81,8 +81,8 @@ def places(body: objects.Body, rng: np.random.Generator, kind: str) -> tuple[jax
         kind: One of `POSES`.
 
     Returns:
-        The pose `(7,)` and the wrench `(6,)`. If the object touches the pad, the wrench is that of a force of 1 N
-        upwards at the object's lowest point. Otherwise the wrench is zero.
+        The pose `(7,)` and the wrench `(6,)`. For the kind `touching`, the wrench is due to a force of 1 N upwards at
+        the object's lowest point. For the other kinds, the wrench is zero.
     """
     quat = rng.normal(size=4)
     quat /= np.linalg.norm(quat)
@@ -123,8 +123,8 @@ def difference(depth: np.ndarray, truth: np.ndarray) -> Difference:
     """Compare a depth image with embree's.
 
     Args:
-        depth: The rendered depth (m), `(h, w)`, infinite beside the object.
-        truth: Embree's depth (m), `(h, w)`, infinite beside the object.
+        depth: The rendered depth (m), `(h, w)`, infinite where a ray misses the object.
+        truth: Embree's depth (m), `(h, w)`, infinite where a ray misses the object.
     """
     seen, hit = np.isfinite(depth), np.isfinite(truth)
     inner = interior(truth)
@@ -157,7 +157,7 @@ def measure(
 ) -> dict[str, Difference]:
     """Compare the depth of rendered frames with embree's.
 
-    Embree traces the object in the balanced pose that the frame reports.
+    Embree traces the object in the pose `Frame.pose`, in which the gel balances the wrench.
 
     Args:
         names: Names of the objects, from `PROCEDURAL`, `LOADED` and `MADE`.

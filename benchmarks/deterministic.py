@@ -47,7 +47,7 @@ class Args:
 
 
 class Network(nnx.Module):
-    """Network from the first images (128x128), pose code and condition to the last images (64x64), pose and outcome."""
+    """Predicts the last images (64x64), pose and outcome from the first images (128x128), pose code and condition."""
 
     def __init__(self, images: int, numbers: int, outcomes: int, rngs: nnx.Rngs) -> None:
         widths = [3 * images, 32, 64, 128, 128]
@@ -110,7 +110,11 @@ def features(inputs: dict[str, Array], condition: Array | None, empty: dict[str,
 
 
 def loss(graphdef: nnx.GraphDef[Network], params: nnx.State, batch: dict[str, Any]) -> Array:
-    """Weighted sum of the cross-entropies of images and outcome and the squared error of the pose, batch mean."""
+    """Compute the mean loss of a batch.
+
+    The loss is a weighted sum of the cross-entropies of both images and of the outcome, and the squared error of the
+    pose.
+    """
     picture, pose, outcome = nnx.merge(graphdef, params)(*features(batch["inputs"], batch["condition"], batch["empty"]))
     targets = batch["targets"]
     visual, tactile = (
@@ -165,7 +169,7 @@ def predict(
     Args:
         graphdef: Definition of the network.
         params: Trained parameters of the network.
-        job: The run's training of the state-space model, for its preprocessing.
+        job: The training job of the run. Its preprocessing decodes the predicted poses.
         arrays: The items.
     """
 

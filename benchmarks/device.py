@@ -15,7 +15,7 @@ the light during each exposure. By this log, an image has a wrong or mixed light
 differs from the requested light by more than 0.1 % of the full light.
 
 The camera limits the rate to one pair per two frame periods plus one settling time. A pair needs one switch of the
-light. Every second switch turns the light on, so this settling time is the mean over both directions.
+light. Switches on and off alternate, so this settling time is the mean of the settling times of the two streams.
 """
 
 import dataclasses
@@ -85,14 +85,14 @@ class Measured(NamedTuple):
 
 
 def serve(link: multiprocessing.connection.Connection, path: Path, lag_s: float, twin: bool) -> None:
-    """Run the emulated devices in a process of their own, until the other process has finished.
+    """Run the emulated devices in a process of their own, until the process that reads pairs has finished.
 
     Args:
-        link: Connection to the other process, to which the camera's address is sent. The other process then sends MOVE
-            any number of times and FINISHED once. The answer to FINISHED is the camera's log: the light of each frame
-            by the key of its image.
-        path: Link to the port of the controller, which is created.
-        lag_s: Time from the end of an exposure to the sending (s).
+        link: Connection to the reading process. The first message is the address of the camera. The reading process
+            then sends MOVE any number of times and FINISHED once. The answer to FINISHED is the camera's log, which
+            maps the key of each image to the light of its frame.
+        path: Symbolic link to the controller's port, which is created.
+        lag_s: Time from the end of an exposure to the sending of the frame (s).
         twin: Use images of the digital twin.
     """
     make: type[twin_peer.TwinPeer | sensor_peer.SensorPeer] = twin_peer.TwinPeer if twin else sensor_peer.SensorPeer
@@ -106,12 +106,12 @@ def serve(link: multiprocessing.connection.Connection, path: Path, lag_s: float,
 
 
 def measure(lag_ms: float, pairs: int, path: Path, *, twin: bool) -> Measured:
-    """Read pairs at one lag, and count the images of a wrong light.
+    """Read pairs of images at one lag, and count the images that were exposed with the light of the other stream.
 
     Args:
-        lag_ms: Time from the end of an exposure to the sending (ms).
-        pairs: Number of pairs to read.
-        path: Link to the port of the controller, which is created.
+        lag_ms: Time from the end of an exposure to the sending of the frame (ms).
+        pairs: Number of pairs of a visual and a tactile image.
+        path: Path at which a symbolic link to the controller's port is created.
         twin: Use images of the digital twin.
     """
     context = multiprocessing.get_context("spawn")

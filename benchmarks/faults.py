@@ -13,7 +13,7 @@ The emulated camera logs the light during each exposure. By this log, an image i
 a wrong or mixed light, or if the camera never took it. An image is counted as old if its exposure began more than the
 settling time before the read.
 
-In the last kind of fault, the program that reads runs in a process of its own, which is killed while a light is on.
+In the last kind of fault, a second process reads the pairs, and this process is killed while a light is on.
 """
 
 import contextlib
@@ -115,7 +115,7 @@ class Bench:
     Args:
         folder: Folder for the links to the controller's ports.
         draw: Source of all random times, lengths and choices.
-        long: Share of the faults of variable length that last 5 to 7 s.
+        long: Share of long faults (5 to 7 s) among the faults of variable length.
     """
 
     def __init__(self, folder: Path, draw: random.Random, long: float):
@@ -417,9 +417,9 @@ def measure_part(order: list[str], seed: int, long: float) -> dict[str, Count]:
     """Inject faults into one emulated sensor with a random lag and a random exposure time.
 
     Args:
-        order: Kinds of the faults, in their order. Programs are killed after all other faults.
+        order: Kind of each fault, in the order of injection. Faults of the kind KILLED come last in any case.
         seed: Seed of all random numbers.
-        long: Share of the faults of variable length that last 5 to 7 s.
+        long: Share of long faults (5 to 7 s) among the faults of variable length.
 
     Returns:
         The results by kind.

@@ -1,4 +1,4 @@
-"""Check of `experiments.gap`: its distances between sets of images whose differences are known.
+"""Check of the distances that `experiments.gap` computes, for sets of images whose differences are known.
 
     python -m benchmarks.gap                                                  # about ten minutes
     python -m benchmarks.gap --out benchmarks/results/gap/known.txt           # also write the table

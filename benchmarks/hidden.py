@@ -8,7 +8,7 @@
 Hidden properties are those that a camera cannot see, such as the fill level of a bottle. The parts are:
 
 - `outcomes`: the share of each outcome. Also the share of the starts whose outcome changes if only the hidden contents
-  are drawn again, which are the fill level and, on the slope, also the side on which the contents lie.
+  are drawn again: the fill level and, on the slope, also the side on which the contents lie.
 - `truth`: the log loss of two classifiers of the outcome. The inputs of the first one are the exact shape, the first
   pose and the jerk (on the slope, the pose has the noise `slope_features.SEEN`). The second one has a noisy measurement
   of touch as a further input: the weight on the jerked pad, or the centre of pressure on the slope. The gain is the
@@ -19,8 +19,9 @@ Hidden properties are those that a camera cannot see, such as the fill level of 
   are visual images of objects in the air, the same images with a tint on the fuller objects, or tactile images. This
   part exists for the jerked pad only, where the containers stand.
 
-Cross-validation folds and 95 % intervals are by object. The starts are simulated with the defaults of the scenario. All
-results are printed. The features of the classifiers are in `benchmarks.instruments`.
+Cross-validation folds and bootstrap samples (for 95 % intervals) contain all starts of an object or none. The starts
+are simulated with the defaults of the scenario. All results are printed. The features of the classifiers are in
+`benchmarks.instruments`.
 """
 
 import dataclasses
@@ -162,7 +163,7 @@ def gains(study: Study, items: list[objects.Body], starts: Starts, read: np.ndar
         study: The study.
         items: The objects.
         starts: Their starts.
-        read: Measurement of touch that a network estimated from images, `(n, k)`. None: omit its lines.
+        read: Measurement of touch that a network estimated from images, `(n, k)`. None: print no lines for the network.
     """
     exact = study.touch(starts)
     rough = exact + study.noise * np.random.default_rng(0).normal(size=exact.shape)
@@ -238,7 +239,7 @@ def aloft(key: PRNGKeyArray, items: list[objects.Body], num: int) -> tuple[Start
 
 
 def detect(name: str, images: np.ndarray, starts: Starts, new: np.ndarray, held_out: Starts, steps: int) -> None:
-    """Print the AUC of a network that detects in images of held-out objects which of them are more than half full.
+    """Print the AUC of a network that detects whether the held-out object in an image is more than half full.
 
     Args:
         name: Name of the images.

@@ -12,9 +12,9 @@ ways, which are called sides:
 - the same with half the time step
 - the same with start, jerk and object mirrored
 - `simulate` with C MuJoCo, also with half the time step and mirrored
-- "C MuJoCo": C MuJoCo with a plain model, in which it finds the contacts of the mesh itself
-- "C, every vertex": C MuJoCo with a contact sphere at every vertex of the hull. Its own contacts of the mesh are used
-  at the pad's rims only, where no vertex touches
+- "C MuJoCo": C MuJoCo with a plain model. The contacts are those that C MuJoCo finds for the mesh
+- "C, every vertex": C MuJoCo with a contact sphere at every vertex of the hull. The contacts that C MuJoCo finds for
+  the mesh act at the pad's rims only, where no vertex touches
 - "C, every vertex, driven pad", for jerked bottles only: the same, but the pad is accelerated on slides under constant
   gravity. On all other sides, the pad is fixed and the jerk is a change of gravity
 
@@ -119,7 +119,7 @@ def box() -> objects.Body:
 
 
 def box_face(first: Float[Array, "7"], last: Float[Array, "7"]) -> Array:
-    """Label of the box: the axis that is vertical at the end (0, 1 or 2), 3 if no axis is, 4 if the box fell off."""
+    """Label of the box: its vertical axis at the end (0, 1 or 2), 3 if no axis is vertical, 4 if the box fell off."""
     del first
     vertical = jnp.abs(geometry.quat_to_matrix(geometry.normalize(last[3:]))[2])
     face = jnp.where(jnp.max(vertical) > UP, jnp.argmax(vertical), 3)
@@ -221,7 +221,7 @@ def c_model(body: objects.Body, contact: physics.Contact, every_vertex: bool, dr
 
 
 def last_in_c(case: Case, traj: physics.Trajectory, *, every_vertex: bool = False, driven: bool = False) -> np.ndarray:
-    """Simulate trajectories in C MuJoCo, from the first frames of given ones.
+    """Simulate in C MuJoCo, from the first frames of given trajectories.
 
     Args:
         case: The case.
@@ -285,7 +285,7 @@ def difference(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
         b: The same for the other side, `(n,)`.
 
     Returns:
-        Middle and half width of the interval of the share of b minus the share of a.
+        Middle and half width of the interval of `mean(b) - mean(a)`.
     """
     gained, lost, count = np.sum(b & ~a) + 0.5, np.sum(a & ~b) + 0.5, len(a) + 2
     middle = (gained - lost) / count

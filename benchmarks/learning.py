@@ -4,12 +4,12 @@
     python -m benchmarks.learning --only statespace  # one kind of model
     taskset -c 0 python -m benchmarks.learning       # on one core
 
-The first line is a training step of the paper's model at batch 64, as in freefall: three modalities, of which touch is
-never an input, and a prediction of all modalities from every subset of the inputs. It is compared with a plain
-implementation of the step, which enumerates all seven subsets of the three modalities and uses XLA's convolutions and
-transposed convolutions. The next lines are training steps with smaller batches, a training step with vision alone, and
-a prediction at batch 1. The last lines are a training step of the state-space model in freefall, and its prediction
-with 16 samples.
+The first line has the time of a training step of the paper's model for freefall at batch 64. This model has three
+modalities. Touch is never an input, and every subset of the inputs predicts all modalities. The step is compared with a
+plain implementation, which enumerates all seven subsets of the three modalities and uses XLA's convolutions and
+transposed convolutions. The next lines have the times of training steps with smaller batches, of a training step with
+vision alone, and of a prediction at batch 1. The last lines have the times of a training step of the state-space model
+for freefall, and of a prediction with 16 samples.
 
 The figures are medians of alternating calls, after one unmeasured call each. The command writes no files.
 """
@@ -55,7 +55,7 @@ def plain_conv(x: Array, kernel: Array, stride: int, padding: int) -> Array:
 
 
 def plain_conv_transpose(x: Array, kernel: Array, stride: int, padding: int) -> Array:
-    """Transposed convolution of XLA with the arguments of `mvae.networks.conv_transpose`, as in `nnx.ConvTranspose`."""
+    """The function `mvae.networks.conv_transpose`, implemented with XLA's transposed convolution."""
     pads = [(len(kernel) - 1 - padding,) * 2] * 2
     return jax.lax.conv_transpose(x, kernel[::-1, ::-1], (stride, stride), pads, dimension_numbers=LAYOUT)
 

@@ -3,10 +3,10 @@
     python -m benchmarks.live
 
 In the digital twin, a hand holds an object in an unstable pose and lets go. Each model predicts the images at rest from
-the images of the held object, as `experiments.live` does. The command prints the skill of these images, which compares
-mean squared errors over all trajectories. It is 0 for the mean image at rest of the other trajectories, and 1 for the
-true image. No model was trained with the twin's noise, vignetting and leaking light. Only `released` was trained on the
-scenario `Released` and on objects of the class that the twin shows.
+the images of the held object, as `experiments.live` does. The command prints the skill of the predicted images, from
+mean squared errors over all trajectories. The skill is 0 for the mean image at rest of the other trajectories, and 1
+for the true image. No model was trained with the twin's noise, vignetting and leaking light. Only the model `released`
+was trained on the scenario `Released` and on objects of the class that the twin shows.
 """
 
 import dataclasses
@@ -78,8 +78,8 @@ def seen(
         predictor: The model.
         pairs: The pairs, `n` of them.
         index: 0 for the visual stream, 1 for the tactile stream.
-        size: Height and width of the result, which divide those of the model's inputs. Images are reduced by means of
-            blocks. Default: the size of the model's inputs.
+        size: Height and width of the result, divisors of the height and width of the model's inputs. Each pixel is the
+            mean of a block of pixels. Default: the size of the model's inputs.
 
     Returns:
         Images in [0, 1], `(n, height, width, 3)`.
@@ -98,14 +98,15 @@ def skill(found: np.ndarray, truth: np.ndarray) -> float:
         truth: True images, of the same shape.
 
     Returns:
-        1 minus the squared error of the predictions over that of the mean of the other true images.
+        `1 - e / e0`, where `e` is the mean squared error of the predictions, and `e0` is the mean squared error of a
+        prediction of each image by the mean of the other true images.
     """
     others = (truth.sum(0) - truth) / (len(truth) - 1)
     return 1 - float(((found - truth) ** 2).mean() / ((others - truth) ** 2).mean())
 
 
 def main(args: Args) -> None:
-    """Record the trajectories, and print the skill of every model with both ways to treat the background."""
+    """Record the trajectories, and print the skill of every model with the background kept and divided out."""
     empty, held, rest = collect(args)
     pinhole, (height, width) = sts.Sensor().camera, empty[0].shape[:2]
     lens = hardware.Lens.ideal(width, height, distance=float(pinhole.distance), field_of_view=math.radians(160))

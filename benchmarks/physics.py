@@ -2,7 +2,7 @@
 
     python -m benchmarks.physics                   # about 2 minutes on two CPU cores
     python -m benchmarks.physics --engines 4       # about 2 minutes
-    python -m benchmarks.physics --pipeline 64     # about a minute (4096 on a GPU, where MJX simulates)
+    python -m benchmarks.physics --pipeline 64     # about a minute on a CPU. On a GPU, use --pipeline 4096
     python -m benchmarks.physics --scaling         # about 10 minutes. Writes benchmarks/results/physics/
     python -m benchmarks.physics --compile         # about 8 minutes
 
@@ -15,7 +15,7 @@ All commands print their results. Only `--scaling` writes files.
   MJX needs a larger `--chunk` than on a CPU.
 - `--pipeline N` drops a bottle N times, renders every frame in both streams as 64x64 uint8 images, and fetches the
   images from the device. It measures seconds and frames per second of physics, of rendering and of both together. A
-  frame is one world at one time.
+  frame is one world at one time. C MuJoCo simulates on a CPU, and MJX on a GPU.
 - `--scaling` measures steps per second of 1 to 4,096 worlds at once (65,536 on a GPU).
 - `--compile` measures the seconds before the first step of each scenario, and counts the compilations for a hundred
   objects. It uses two new processes. The first one starts with an empty compilation cache, and the second one with the
@@ -204,7 +204,7 @@ def worlds(count: int, frames: int) -> tuple[Worlds, mjx.Model, mjx.Data]:
     """Make the arguments that `simulate` passes to MJX for drops of the rod from 2 mm.
 
     Args:
-        count: Number of worlds. From 256 on, the starts repeat.
+        count: Number of worlds. There are at most 256 different starts, which further worlds repeat.
         frames: Frames of each trajectory.
 
     Returns:
@@ -229,7 +229,7 @@ def scaling(frames: int = 8, chunk: int = 32) -> None:
 
     Args:
         frames: Frames of each trajectory.
-        chunk: Worlds of one call, where the worlds are divided between threads.
+        chunk: Number of worlds in each call, if the worlds are divided between threads.
     """
     gpu = jax.default_backend() != "cpu"
     counts = [4**k for k in range(9 if gpu else 7)]
@@ -271,7 +271,7 @@ def write_scaling(rows: Sequence[Speeds], device: str, chunk: int) -> None:
     Args:
         rows: Steps per second for each number of worlds.
         device: Name of the device, for the title.
-        chunk: Worlds of one call, where the worlds are divided between threads.
+        chunk: Number of worlds in each call, if the worlds are divided between threads.
     """
     from matplotlib.figure import Figure
 

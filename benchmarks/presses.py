@@ -16,7 +16,7 @@ then fits the positions and colours of the lights, the fall-off, the specular sh
 explain the images, and need not be at the places of the sensor's LEDs. A few of them end up below the image.
 
 The command prints the peak signal-to-noise ratio of the background alone, of a fit with far lights, and of a fit with
-near lights. The ratio is over all pixels of all held-out presses within 0.92 of the radius of the contact.
+near lights. The ratio is over all held-out presses, and over the pixels within 0.92 times the radius of the contact.
 `presses.png` has a column for each held-out press: the real image, our image, and four times their difference on grey.
 Outside of the contact the shape of the skin is unknown, and our image is the background. Candidates, number of steps
 and learning rate were chosen on the 36 presses alone.

@@ -39,8 +39,7 @@ def main(args: Args) -> str:
     """Draw the picture and return the answers as text.
 
     Raises:
-        ValueError: `first` is negative, or the held-out list has fewer than ten trajectories from this index to its
-            end.
+        ValueError: `first` is negative, or the held-out list has fewer than ten trajectories from index `first` on.
     """
     if args.first < 0:
         raise ValueError(f"--first must be at least 0, got {args.first}")

@@ -1,12 +1,12 @@
-"""Time to write a pair of images of the real sensor to disk, and the size of its files.
+"""Time to write a pair of images of the real sensor to disk, and the size of the files.
 
     python -m benchmarks.recording                  # a few seconds
     python -m benchmarks.recording --folder /mnt    # on another disk
 
-Writes pairs as `hardware.Session` does: both images as PNG files, in a folder that also has their checksums, flushed to
-the disk. The images are smooth, without noise or with noise of a standard deviation of 1.5 of 255. Prints, for two
-image sizes, the size of a pair, the median times to encode and to write it, and the longest time of both together. The
-files are deleted afterwards.
+Writes pairs as `hardware.Session` does. The folder of a pair contains both images as PNG files and the checksums of the
+files, and is flushed to the disk. The images are smooth, without noise or with noise of standard deviation 1.5 (of
+255). Prints, for two image sizes, the size of a pair, the median time of encoding, the median time of writing, and the
+longest time of encoding and writing together. The files are deleted afterwards.
 """
 
 import dataclasses

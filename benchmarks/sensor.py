@@ -14,12 +14,13 @@ and segmentation. For comparison, embree traces only the depth of the same faces
 - `built`: the same, but the scene is built for each pose, as a moving object needs it
 - `trimesh`: the Python interface `mesh.ray` of trimesh
 
-Everything runs in one thread, and in as many threads as there are cores. One call of `sense` uses little more than one
-core, so `dataset.collect` renders in threads too. On a GPU, `sense` renders a batch instead. The calls alternate, and
-the figures are medians. A ratio is embree's seconds divided by the seconds of `sense`, with the same number of threads.
+All calls are timed in one thread, and also in as many threads as there are cores. One call of `sense` uses little more
+than one core, so `dataset.collect` renders in threads too. On a GPU, `sense` renders a batch instead. The calls
+alternate, and the figures are medians. A ratio is embree's seconds divided by the seconds of `sense`, with the same
+number of threads.
 
 A second table has the share of each stage in the time of `sense`. At 640x480 it also has the speed relative to the
-paper's code, whose renderer and shader we measured at 0.40 s per frame on such a CPU, without physics.
+paper's code, whose renderer and shader we once measured at 0.40 s per frame on a CPU, without physics.
 """
 
 import concurrent.futures

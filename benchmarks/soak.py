@@ -8,7 +8,7 @@
 Every eight trajectories have a new object. Its class changes in turn, except on the jerked pad, where all objects are
 bottles. The command counts outcomes, unsettled trajectories, and trajectories that `simulate` discarded and drew again,
 because they were not finite or because the object sank deeper into the pad than the limit. It compares the wrench at
-rest with the weight, and the energy out of contact with the energy at the start. All results are printed.
+rest with the weight, and the energy in frames without contact with the energy at the start. All results are printed.
 
 The trajectories are simulated in blocks of 504, or of fewer if fewer are requested. `benchmarks.hidden --soaked FOLDER`
 analyses the blocks that `--keep FOLDER` has kept.
@@ -94,8 +94,8 @@ def block(name: str, index: int, size: int) -> dict[str, np.ndarray]:
 
     Returns:
         Arrays by name, with a row for each trajectory. `wrench_error` is the error of the force at rest, as a share of
-        the weight, and `excess` the largest energy out of contact, see `excess_energy`. Both are nan where they do not
-        apply.
+        the weight, or nan if the object does not rest on the pad alone. `excess` is the largest `excess_energy` in
+        frames without contact. It is -inf if the object fell off or always had contact, and nan if gravity changes.
     """
     scenario = SCENARIOS[name]
     first = index * size // NUM

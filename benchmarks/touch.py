@@ -1,11 +1,11 @@
-"""Accuracy of the mass of held-out objects that a regression estimates from their uint8 tactile images at rest.
+"""Accuracy of a regression that estimates the mass of held-out objects from their uint8 tactile images at rest.
 
     python -m benchmarks.touch          # about a minute, for the dataset of runs/freefall
     python -m benchmarks.touch FOLDER   # another dataset of procedural objects of all classes
 
 A ridge regression of the logarithm of the mass on simple features of the image (sums, size and depth of the imprint) is
-fitted to the training objects. Prints its accuracy on held-out objects, and the share of imprint pixels that are
-saturated, at 0 or 255. Both use the last images of objects that rest on the pad. Writes no files.
+fitted to the training objects. The command uses the last images of objects that rest on the pad. It prints the accuracy
+on held-out objects, and the share of imprint pixels that are saturated, at 0 or 255. It writes no files.
 """
 
 import dataclasses

@@ -2,10 +2,10 @@
 
     python -m benchmarks.twin
 
-Prints, for each size, the time to render a pose, the time to make a frame with noise whose light is on for half of the
-exposure, and the time to encode it as JPEG. Also prints the frames per second on the virtual clock, and the frames per
-second that a second process receives through OpenCV, both with the light off. All values are medians, and all processes
-run on one CPU core.
+Prints, for each size, the time to render a pose, the time to make a noisy frame with the light on for half of the
+exposure, and the time to encode this frame as JPEG. With the light off, it also prints the frames per second on the
+virtual clock, and the frames per second that a second process receives through OpenCV. All values are medians, and all
+processes run on one CPU core.
 """
 
 import dataclasses

@@ -99,7 +99,7 @@ def find(config: Config) -> str:
         A text that lists the cameras and serial ports, and ends with the command to run next.
 
     Raises:
-        ValueError: There is no camera or no USB serial port, and the option does not name one.
+        ValueError: `camera` is None and no camera was found, or `leds` is None and no USB serial port was found.
     """
     found, lines, words = hardware.find_sensors(), [], ["python", "-m", "experiments.commission"]
     ports = [port for port in found.ports if port.vendor is not None]
@@ -258,7 +258,7 @@ def claim_pictures(config: Config, camera: hardware.Camera) -> None:
     """Reserve the folder of live pictures for one camera, image size and print of the board.
 
     Raises:
-        ValueError: The folder contains pictures of another camera, size or print.
+        ValueError: The folder has pictures from another camera, of another size, or of another print of the board.
     """
     made = {"camera": camera.source, "width": config.width, "height": config.height, "ruler": config.ruler}
     _files.claim(config.out / "board" / "camera.json", made)

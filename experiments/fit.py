@@ -3,14 +3,14 @@
     python -m experiments.fit scissors --out fit.png     # a minute or two
     python -m experiments.fit mug.obj --longest-side 0.1 --mass 0.3 --sensor soft.json
 
-The first argument is an object class or a mesh file, as in experiments.sense. The target is one tactile image, in eight
-bits, of the object at rest under its weight. The object, the face on which it rests and its weight are known. The
-command fits x, y and yaw ten times. Each fit starts 3 mm and 10 degrees away from the true pose.
+The first argument is an object class or a mesh file, as in experiments.sense. The target is one 8-bit tactile image of
+the object at rest under its weight. The object, the face on which it rests and its weight are known. The command fits
+x, y and yaw ten times. Each fit starts 3 mm and 10 degrees away from the true pose.
 
-A line is printed for each fit, and then the number of fits that end within 0.2 mm and 1 degree of the true pose. These
-are all ten for scissors, fork and mouse, and eight for scissors with `--seed 1`. The picture shows the target, the
-images at the start and at the end of the first fit, and the path of every fit. To fit an image of your own, use it as
-`target` of `slope` in the function that `descend` minimises.
+A line is printed for each fit. The next line contains the number of fits that end within 0.2 mm and 1 degree of the
+true pose. This number is ten for scissors, fork and mouse, and eight for scissors with `--seed 1`. The picture shows
+the target, the images at the start and at the end of the first fit, and the path of every fit. To fit your own image,
+pass the image to `slope` as `target`, and pass `descend` a function that calls `slope`.
 """
 
 import dataclasses
@@ -63,9 +63,10 @@ class Config(sense.Config):
 
 
 class Slope(NamedTuple):
-    """The difference r of an image from the target, and its derivatives J by (x, y, yaw).
+    """The loss of an image, with the gradient and the Gauss-Newton matrix with respect to (x, y, yaw).
 
-    r is the vector of the n pixel values of the blurred difference, and J = dr / d(x, y, yaw) has the shape (n, 3).
+    r is the vector of the n pixel values of the blurred difference between the image and the target. The matrix
+    J = dr / d(x, y, yaw) has the shape (n, 3).
     """
 
     image: jax.Array  # tactile image, shape (h, w, 3)
@@ -83,7 +84,7 @@ def touch(
 
 
 def moved(pose: jax.Array, at: jax.Array) -> jax.Array:
-    """Shift a pose, and turn it about the vertical through its own origin.
+    """Shift a pose, and turn the pose about the vertical axis through the object's origin.
 
     Args:
         pose: Pose of the object in the sensor frame, shape (7,).
@@ -99,7 +100,7 @@ def moved(pose: jax.Array, at: jax.Array) -> jax.Array:
 
 
 def carried(wrench: jax.Array, pose: jax.Array, at: jax.Array) -> jax.Array:
-    """Move the wrench of a vertical force with the object.
+    """Compute the new wrench of a vertical force that moves with the object.
 
     Args:
         wrench: Force and moment of the pad on the object in `pose`, shape (6,).
@@ -107,7 +108,7 @@ def carried(wrench: jax.Array, pose: jax.Array, at: jax.Array) -> jax.Array:
         at: Shift in x and y (m) and turn (rad) of the object, as in `moved`, shape (3,).
 
     Returns:
-        Wrench of the same force at the same place of the object, shape (6,).
+        Wrench after the move, shape (6,). The force acts at the same point of the object as before the move.
     """
     force = wrench[2]
     x, y = -wrench[4] / force - pose[0], wrench[3] / force - pose[1]
@@ -128,10 +129,11 @@ def slope(
     *,
     resolution: tuple[int, int],
 ) -> Slope:
-    """Compare the blurred image of the moved object with the blurred target, and differentiate by the move.
+    """Compute the loss of the moved object's image, and the derivatives of the loss with respect to the move.
 
-    The balance of the gel determines the depth and the tilt of the object. It is solved anew for each move. The
-    derivative treats depth and tilt as constant, because the pad is the same everywhere.
+    The image and the target are blurred before they are compared. For each move, the depth and the tilt of the object
+    are computed from the balance of forces in the gel. The derivatives treat the depth and the tilt as constant,
+    because the pad is the same everywhere.
 
     Args:
         sensor: Constants of the sensor.
@@ -160,7 +162,7 @@ def descend(look: Callable[[np.ndarray, float], Slope], start: np.ndarray) -> li
     """Minimise the loss by Levenberg-Marquardt steps, first with the strongest blur and last with the weakest.
 
     Args:
-        look: Function of (x, y, yaw) and the blur (m) that returns the difference from the target and its derivatives.
+        look: Function of (x, y, yaw) and the blur (m) that returns the loss and its derivatives, as `slope` does.
         start: Initial x (m), y (m) and yaw (rad).
 
     Returns:

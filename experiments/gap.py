@@ -7,9 +7,10 @@
 `--real` and `--simulated` are sessions of `experiments.real collect`. The simulated images may also be the dataset of
 an experiment that was run with `--collection.no-crop`. Raw images are rectified with the lens of the sensor file.
 
-The command prints differences per pixel, a distance between both distributions in a feature space, and the accuracy of
-a classifier that tries to distinguish real from simulated images. The same text and a figure are written to `--out`.
-This takes about a minute for 40 trajectories. The classifier needs scikit-learn (`pip install -e '.[bench]'`).
+The command prints differences per pixel, the distance between the distributions of real and simulated images in a
+feature space, and the accuracy of a classifier that tries to distinguish real from simulated images. The same text and
+a figure are written to `--out`. The command takes about a minute for 40 trajectories. The classifier needs
+scikit-learn (`pip install -e '.[bench]'`).
 """
 
 import dataclasses
@@ -74,7 +75,7 @@ def session(folder: Path, sensor: Path | None, resolution: tuple[int, int]) -> S
     Raises:
         FileNotFoundError: There is no session or no sensor file.
         SensorFileError: The sensor file is damaged or describes no device.
-        ValueError: There is no confirmed trajectory, or the images differ in size from those of the lens.
+        ValueError: There is no confirmed trajectory, or the lens was calibrated with images of another size.
     """
     recordings = hardware.load_recordings(folder)
     size = f"{resolution[0]} x {resolution[1]}"
@@ -151,8 +152,9 @@ def load(config: Config) -> tuple[Side, Side]:
     """Read the images that are compared.
 
     Returns:
-        The real and the simulated images. With `--match number`, both contain the same trajectories. With
-        `--match none`, no trajectory number occurs in both.
+        The real and the simulated images. With `--match number`, the real and the simulated images have the same
+        trajectory numbers. With `--match none`, the simulated trajectories get new numbers, which differ from all
+        numbers of real trajectories.
 
     Raises:
         FileNotFoundError: A folder contains no session or dataset.
@@ -183,8 +185,8 @@ def load(config: Config) -> tuple[Side, Side]:
     common = np.intersect1d(real.images.group, simulated.images.group)
     if not len(common):
         raise ValueError(
-            f"{config.real} and {config.simulated} have no trajectory number in common: if both folders show the same "
-            "object, but the poses in the two folders differ, give --match none"
+            f"{config.real} and {config.simulated} have no trajectory number in common: give --match none if the "
+            "folders show the same object in different poses"
         )
     return real.of(common), simulated.of(common)
 

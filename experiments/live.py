@@ -1,17 +1,17 @@
-"""Predict the resting state from live images about ten times a second, and show it beside them.
+"""Predict the images at rest from live images about ten times a second, and show the live and the predicted images.
 
     python -m experiments.live                                            # starts a digital twin and opens a page
     python -m experiments.live --sensor bench                             # the sensor of a sensor file
-    python -m experiments.live --camera URL --leds PORT --sensor bench    # names the devices of the file
-    python -m experiments.live --sensor bench --record runs/monday        # and records both streams
-    python -m experiments.live --replay runs/monday --loop                # plays them back, with predictions
+    python -m experiments.live --camera URL --leds PORT --sensor bench    # replaces the device paths of the file
+    python -m experiments.live --sensor bench --record runs/monday        # also records both streams
+    python -m experiments.live --replay runs/monday --loop                # predicts from a recording
     python -m experiments.live --replay visual.mp4 tactile.mp4 --sensor bench
     python -m experiments.live --headless --seconds 20 --save live.png    # without a page
 
 The page shows the newest visual and tactile image, the predicted images at rest, and the probabilities of the outcomes.
-It also shows if the object touches the pad, and the rate and the latency of the predictions. The default model was
-trained on simulated cameras that are held and released. At the first start, a twin compiles for about two minutes and
-the model for half a minute.
+The page also shows if the object touches the pad, and the rate and the latency of the predictions. The default model
+was trained in simulation on one class of object: a small camera that a hand holds and releases. At the first start, a
+twin compiles for about two minutes, and the model compiles for half a minute.
 """
 
 import collections
@@ -166,7 +166,7 @@ def views(config: Config, source: Source, first: hardware.Shot) -> Views:
     Args:
         config: Options of the command line.
         source: Source of the images.
-        first: Any image of the source. Its size determines the lens that is assumed without a sensor file.
+        first: Any image of the source. Without a sensor file, an ideal lens for images of this size is assumed.
     """
     if source.file is None:
         height, width = first.image.shape[:2]

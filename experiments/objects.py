@@ -2,14 +2,14 @@
 
     python -m experiments.objects --out sheet.png --seed 0 --num 10
 
-The command takes about half a minute on two CPU cores for 8 x 10 objects. `--view side` is the view of a person,
-`--view below` that of the sensor. `--shuffle` draws the objects in random order without names, so that other people can
-try to recognise them.
+The command takes about half a minute on two CPU cores for 8 x 10 objects. `--view side` shows the objects as a person
+sees them, and `--view below` shows the objects as the sensor sees them. `--shuffle` draws the objects in random order
+without names, so that other people can try to recognise them.
 
-A line is printed for each object: its size, its faces, its collision hull, and two gaps between hull and surface. The
-first gap is the largest distance by which the surface reaches out of the hull, the second one the largest distance from
-the hull down to the surface. `--parts` first decomposes objects whose hull fits badly into convex parts, which takes
-about ten seconds each.
+A line is printed for each object: its size, its number of faces, its collision hull, and two gaps. The first gap is the
+largest distance by which the surface lies outside the hull. The second gap is the largest distance by which the hull
+lies outside the surface. If the hull of an object fits badly, `--parts` first decomposes the object into convex parts,
+which takes about ten seconds per object.
 """
 
 import dataclasses

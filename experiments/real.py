@@ -1,7 +1,7 @@
 """Collect and review trajectories of the real sensor or its digital twin, and learn from them (the paper's Table 2).
 
     python -m experiments.real                    # about 15 minutes, collects 100 trajectories of the twin if needed
-    python -m experiments.real --preset paper     # 500 at 1640x1232 and the paper's schedule. Prints its time first
+    python -m experiments.real --preset paper     # 500 at 1640x1232, the paper's schedule, prints a time estimate first
     python -m experiments.real --preset smoke     # a short run of every stage, for tests
     python -m experiments.real --plan             # prints the expected seconds of each stage
 
@@ -14,15 +14,15 @@
 
 The default sub-command is `train`. It trains VAE visual, VAE tactile and MVAE without pose on the trajectories in
 `WORKDIR/dataset`. The models learn to predict the images of the object at rest from the images of the held object.
-Results go to `WORKDIR/table2`. A work directory cannot contain trajectories of a device and of the twin, so give the
-twin a `--workdir` of its own.
+Results go to `WORKDIR/table2`. A work directory cannot contain trajectories of both a device and the twin, so give the
+twin a separate `--workdir`.
 
 `--sensor` is the sensor file of `experiments.commission`. It contains the lens and images of the empty pad, which
 training needs.
 
 `collect` guides a person through trajectories: place the object in an unstable pose, hold it, release it, wait until it
 rests. The initial and the final pair of images are saved at once, raw and uncropped, into `WORKDIR/dataset`. Confirmed
-trajectories survive an interruption. The same command then continues with the next number.
+trajectories survive an interruption. After an interruption, the same command continues with the next trajectory.
 """
 
 import argparse
@@ -76,7 +76,7 @@ def parse(words: Sequence[str]) -> Train | Collect | Review:
 
 
 def main(config: Train | Collect | Review) -> None:
-    """Run a sub-command, and print an error that the user can correct on one line."""
+    """Run a sub-command. If the user can correct an error, print the error on one line without a traceback."""
     with errors.on_one_line(debug=config.debug):
         try:
             match config:

@@ -4,9 +4,9 @@
     python -m experiments.sense mug.obj --longest-side 0.1 --mass 0.3 --resolution 1232 1640
     python -m experiments.sense classes --out classes.png --resolution 1232 1640    # all eight, about a minute
 
-The object is at rest under its own weight unless options change this. The picture shows the visual and the tactile
-image, the image with the LEDs at half of their power, depth, segmentation and pressure, pixel for pixel. The command
-prints the size of the object, the face on which it rests, and how deep it sinks into the gel.
+By default, the object is at rest under its own weight. The picture shows six images: the visual image, an image with
+the LEDs at half power, the tactile image, depth, segmentation and pressure. The command prints the size of the object,
+the face on which it rests, and how deep it sinks into the gel.
 """
 
 import dataclasses
@@ -180,7 +180,7 @@ def see(
     crop: bool,
     light: float,
 ) -> tuple[sts.Frame, jax.Array]:
-    """Render the frame, and the image with the LEDs at the share `light` of their power."""
+    """Render the frame, and an image with the LEDs at `light` times full power."""
     frame = sts.sense(sensor, body, pose, wrench, resolution=resolution, crop=crop)
     return frame, sts.expose(sensor, frame, light)
 
@@ -189,7 +189,7 @@ def look(config: Config, sensor: sts.Sensor, body: sts.objects.Body) -> tuple[st
     """Place and render the object.
 
     Returns:
-        The frame, the image with the LEDs at `config.light` of their power, and a description of three lines.
+        The frame, an image with the LEDs at `config.light` times full power, and a description of three lines.
     """
     pose, wrench, words = lay(config, sensor, body)
     given = sensor, body, jnp.asarray(pose, jnp.float32), jnp.asarray(wrench, jnp.float32)
@@ -211,7 +211,10 @@ def look(config: Config, sensor: sts.Sensor, body: sts.objects.Body) -> tuple[st
 
 
 def panels(frame: sts.Frame, between: np.ndarray, light: float) -> list[tuple[str, np.ndarray]]:
-    """All outputs as captions and images in [0, 1]. Near depths are bright, and pressure is on the gel's grid."""
+    """Return a caption and an image in [0, 1] for each output.
+
+    In the depth image, near points are bright. The pressure image has the resolution of the gel's grid.
+    """
     seen = np.asarray(frame.segmentation)
     depth = np.where(seen, np.asarray(frame.depth), np.nan)
     near, far = (np.nanmin(depth), np.nanmax(depth)) if seen.any() else (0.0, 1.0)
@@ -230,10 +233,10 @@ def panels(frame: sts.Frame, between: np.ndarray, light: float) -> list[tuple[st
 
 
 def compose(pictures: list[tuple[str, np.ndarray]], columns: int) -> Image.Image:
-    """Arrange images in rows, pixel for pixel, each with a caption above.
+    """Arrange images in rows, each with a caption above.
 
     Args:
-        pictures: Captions and images. An image of another size than the first one is scaled to fit.
+        pictures: Captions and images. Images of other sizes are scaled to fit the size of the first image.
         columns: Number of images in a row.
     """
     height, width = pictures[0][1].shape[:2]

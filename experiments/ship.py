@@ -45,8 +45,7 @@ def ship(workdir: Path, name: str) -> str:
         A line with the size and the differences of the predictions.
 
     Raises:
-        ValueError: The model is too large, or the name is not made of letters, digits and underscores, or begins with a
-            digit.
+        ValueError: The model is too large, or the name is not a Python identifier.
         OSError: A file of the model is damaged or missing, or the library's folder cannot be written to.
     """
     if not name.isidentifier():

@@ -2,8 +2,8 @@
 
     python -m experiments.show perturbed --num 4 --out show    # about a minute on two CPU cores
 
-The files are OUT/SCENARIO-NUMBER.png and OUT/SCENARIO-NUMBER.gif. The objects are drawn from the same classes as in the
-default experiment of the scenario, with the seed of `--seed`.
+The files are OUT/SCENARIO-NUMBER.png and OUT/SCENARIO-NUMBER.gif. The objects have the same classes as in the default
+experiment of the scenario. `--seed` is the seed of the objects and the trajectories.
 """
 
 import dataclasses

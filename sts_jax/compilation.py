@@ -20,8 +20,8 @@ def enable_compilation_cache(folder: str | os.PathLike[str] | None = None) -> Pa
     in `experiments` call it. The library itself never calls it.
 
     On a CPU, XLA logs an error about processor features for each program that it loads from the cache. This message is
-    harmless. XLA lists two of its own tuning options among the features of the processor that compiled the program, and
-    does not find them on any processor (JAX issue 38445). Set the environment variable TF_CPP_MIN_LOG_LEVEL=3 before
+    harmless. XLA stores two of its own tuning options with the program as if these were features of a processor, but no
+    processor has such features (JAX issue 38445). Set the environment variable TF_CPP_MIN_LOG_LEVEL=3 before
     `import jax` to hide the message.
 
     Args:

@@ -120,8 +120,8 @@ def save(path: str | os.PathLike[str], thing: Frame | Body | Trajectory | ArrayL
 
     Raises:
         TypeError: The format cannot store an item of this type.
-        ValueError: The path has another suffix, the image has another shape, type or range, or a batch of frames was
-            given for a `.png` file.
+        ValueError: The suffix of the path is not `.npz` or `.png`, the shape, type or range of the image is invalid, or
+            a batch of frames was given for a `.png` file.
         OSError: The file cannot be written.
     """
     path = Path(path)

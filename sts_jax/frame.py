@@ -145,9 +145,9 @@ def expose(sensor: Sensor, frame: Frame, light: ScalarLike) -> Float[Array, "*n 
 
         image = ((1 - l) V + l k T) / (1 - l + l k)
 
-    V is the visual and T the tactile stream, l is `light`, and k is the exposure time of V divided by that of T
-    (`Room.exposure`). The denominator is the exposure time at level 0 divided by that at level l. A pixel that is
-    equally bright in both streams is therefore equally bright at every level.
+    V is the visual stream, T is the tactile stream, l is `light`, and k is the ratio of the exposure time of V to the
+    exposure time of T (`Room.exposure`). The denominator is the ratio of the exposure time at level 0 to the exposure
+    time at level l. A pixel that is equally bright in both streams is therefore equally bright at every level.
 
     Args:
         sensor: Sensor that made the frame.
@@ -194,15 +194,15 @@ def touch(
     Returns:
         Image in [0, 1]. If its shorter side has at least `Sensor.fine_below` pixels, it equals the image
         `Frame.tactile` that `sense` renders for the same imprint. For smaller images, `sense` samples more finely than
-        `touch`. If a number in a traced `window` or in a traced constant of the sensor is invalid, no error is raised.
-        In both cases, the image shows flat skin, and `window` counts as None. In the second case, all traced constants
-        also get their default values.
+        `touch`. If a number in a traced `window` or in a traced constant of the sensor is invalid, the image shows flat
+        skin, and `window` counts as None. If the invalid number is in a constant, all traced constants also get their
+        default values.
 
     Raises:
         TypeError: `sensor` is not a `Sensor`, or `imprint` or `window` is not an array of numbers.
-        ValueError: `imprint` is empty, is not two-dimensional or has an integer type. Or `window` does not have the
-            shape (4,), is not finite or has no area. Or a constant of the sensor is out of range (`Sensor.check`).
-            A traced value causes an error only if its shape or type is wrong.
+        ValueError: `imprint` is empty, is not two-dimensional or has an integer type. The error is also raised if
+            `window` does not have the shape (4,), is not finite or has no area, or if a constant of the sensor is out
+            of range (`Sensor.check`). A traced value causes an error only if its shape or type is wrong.
     """
     _check_sensor(sensor)
     imprint = _imprint_in_metres(imprint)

@@ -1,4 +1,4 @@
-"""`Predictor`: a trained model as a function that predicts both images and the pose at rest from earlier ones."""
+"""`Predictor`: a trained model as a function that predicts the last frame of a trajectory from the first frame."""
 
 import dataclasses
 import importlib.resources
@@ -168,7 +168,7 @@ class Predictor:
                 model was trained with blank tactile images as inputs.
             pose: Poses of the object, (*n, 7): position (m) and unit quaternion, mesh frame in the sensor frame.
             condition: Known parameters of the trajectories in SI units, (*n, c), for models that were trained with
-                them. For scenario `Perturbed`: acceleration of the pad along x and y (m/s^2), and its duration (s).
+                them. For the scenario `Perturbed`: acceleration of the pad along x and y (m/s^2), and its duration (s).
             state: Codes of the true pose, shape and mass, (*n, code), from `statespace.encode`. Only for state-space
                 models. With the true state of a simulation, the remaining error is that of the learned physics and of
                 the decoder.
@@ -220,8 +220,8 @@ class Predictor:
         Args:
             shape: Sizes of the leading axes of the predictions. The default is a single prediction.
             condition: Known parameters of each trajectory in SI units, (*shape, number of parameters), for models that
-                were trained with them. For scenario `Perturbed`: acceleration of the pad along x and y (m/s^2), and
-                its duration (s).
+                were trained with them. For the scenario `Perturbed`: acceleration of the pad along x and y (m/s^2),
+                and its duration (s).
 
         Returns:
             The predictions.

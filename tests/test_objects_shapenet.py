@@ -120,7 +120,7 @@ def test_a_larger_object_is_scaled_down_with_a_note(tmp_path):
     listed = only(tmp_path, box((3, 2, 20)))
     entry = objects.read(listed, 0)
     np.testing.assert_allclose(np.ptp(np.asarray(entry.body.vertices), axis=0), [0.018, 0.012, 0.12], rtol=1e-5)
-    assert entry.notes == ("the longest side is 0.508 m, scaled down to 0.12 m",)
+    assert entry.notes == ("the longest side of 0.508 m is scaled down to 0.12 m",)
     (note,) = objects.read(dataclasses.replace(listed, largest=0.05), 0).notes
     assert note.endswith("scaled down to 0.05 m")
 

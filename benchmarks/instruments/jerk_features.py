@@ -73,10 +73,10 @@ def canonical(pose: np.ndarray, condition: np.ndarray) -> tuple[np.ndarray, np.n
 def tipping(rigid: np.ndarray, base: np.ndarray, push: np.ndarray, time: np.ndarray, friction: float) -> np.ndarray:
     """Compute two ratios that decide whether a standing object topples over the edge of its base.
 
-    The first ratio is the acceleration over g b / h, the acceleration at which the object begins to tip, where b is the
-    radius of the base and h the height of the centre of mass. The second ratio is the energy at the end of the push
-    over the energy that lifts the centre of mass over the edge. Both exceed 1 for an object that topples. Friction
-    limits the force, and the push then acts for a longer time.
+    The object begins to tip at the acceleration g b / h, where b is the radius of the base and h the height of the
+    centre of mass. The first ratio is the acceleration divided by g b / h. The second ratio is the energy at the end of
+    the push divided by the energy that lifts the centre of mass over the edge. Both ratios exceed 1 for an object that
+    topples. In the second ratio, friction limits the force, and a limited force acts for a longer time.
 
     Args:
         rigid: Mass (kg), height of the centre of mass (m), and inertia about a horizontal axis through the centre of

@@ -52,8 +52,8 @@ class Peer:
         Args:
             path: Symbolic link to the port, which is created or replaced.
             serial_number: Serial number of the controller.
-            talk: Bytes that are sent instead of any answer, also without a request, as another device would. None:
-                the controller answers requests.
+            talk: Bytes that are sent repeatedly, with or without a request, as if the port were that of another device.
+                None: the controller answers requests.
             clock: The controller's clock, a function that returns seconds.
             make: Function that makes the emulated controller at each boot.
         """

@@ -1,7 +1,7 @@
 """An emulated sensor: an LED controller on a pseudo-terminal, and a camera that sees the controller's lights.
 
 The grey value of a frame is the mean light of its exposure. A corner of the frame shows the frame's number. The camera
-logs the light of each number, so a benchmark can check the light of an image independently of `hardware.STS`.
+logs the light by frame number, so a benchmark can check the light of an image independently of `hardware.STS`.
 """
 
 import dataclasses
@@ -57,7 +57,7 @@ class Lights:
         return found, mean
 
     def off_after(self, time_s: float) -> float | None:
-        """Return the time (s) since which the lights have been off, but at least `time_s`. None: the lights are on."""
+        """Return `time_s` or the time (s) at which the lights went off, the later of both. None: the lights are on."""
         with self._lock:
             since_s, share = self._changes[-1]
         return max(since_s, time_s) if share == 0 else None
@@ -182,7 +182,10 @@ class SensorPeer:
         self.lights.changed(protocol.DARK)
 
     def judged(self, image: Image, *, lit: bool) -> bool:
-        """Return whether the camera took an image while all lights were on (`lit`) or off for the whole exposure."""
+        """Return True if all lights were on (`lit=True`) or off (`lit=False`) during the whole exposure of an image.
+
+        Return False for images that the camera did not take.
+        """
         found = self.camera.exposure_of(image)
         return found is not None and found.shares == [1.0 if lit else 0.0]
 

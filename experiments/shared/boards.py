@@ -99,7 +99,7 @@ class Pictures:
         return dataclasses.replace(self, names=names, found=(*there[:place], found, *there[place:]))
 
     def describe(self) -> str:
-        """A text with the parts of the image in which corners of the board were found, and those without."""
+        """A text with the number of image parts in which the board was found, and the names of the other parts."""
         there = hardware.covered(self.found, self.size)
         missing = [part for part in PARTS if part not in there]
         return f"{len(there)} of {len(PARTS)} parts of the image covered" + (
@@ -130,7 +130,8 @@ def take(pictures: Pictures, sensor: hardware.STS, number: int, every: float | N
     """Take pictures of the board until there are enough. Each picture is written to the folder at once.
 
     Args:
-        pictures: Pictures of an earlier run, which count too. If `000.png` was deleted, it is taken first.
+        pictures: Pictures of an earlier run, which count towards `number`. If `000.png` is missing, the first new
+            picture becomes `000.png`.
         sensor: Connected sensor.
         number: Number of pictures in which the board must be found.
         every: Time to wait before each picture (s). None: wait for the Enter key.

@@ -49,8 +49,8 @@ def device(config: Collect) -> tuple[hardware.STS, EmptyPad | None]:
     """Make the sensor that the options describe.
 
     Returns:
-        The sensor, which is not connected yet, and the empty pad from the backgrounds of the sensor file, or None
-        without backgrounds.
+        The sensor, which is not connected yet, and the empty pad from the backgrounds of the sensor file. The empty
+        pad is None if there are no backgrounds.
 
     Raises:
         ValueError: An option is missing or out of range, or contradicts the sensor file.
@@ -158,7 +158,7 @@ def of_twin(config: Collect) -> simulated.Simulated:
 def keep(file: Path, workdir: Path) -> None:
     """Copy a sensor file and its backgrounds into a work directory.
 
-    If the work directory contains a sensor file already, only check that both describe the same device.
+    If the work directory already contains a sensor file, only check that both files describe the same device.
 
     Args:
         file: Path of the sensor file or of its folder.
@@ -186,7 +186,9 @@ def keep(file: Path, workdir: Path) -> None:
 
 @contextlib.contextmanager
 def person(config: Collect) -> Iterator[Person]:
-    """Make the page or the terminal on which a person sees the instructions and acts, and close it afterwards.
+    """Make the page or terminal that shows instructions to a person and receives the person's actions.
+
+    The page is closed afterwards.
 
     Raises:
         OSError: The address of the page cannot be used.

@@ -166,8 +166,8 @@ def with_meshes(
         collection: Collection of procedural objects.
         folder: Folder of mesh files, or of ShapeNetSem.
         workdir: Work directory for the listing.
-        classes: Classes to use. If empty, the classes that the collection and the folder share are used, or all classes
-            of the folder if they share none.
+        classes: Classes to use. If empty, the classes that occur in both the collection and the folder are used. If no
+            class occurs in both, all classes of the folder are used.
         scale: Length of one unit of the files (m). Default: as in `objects.library`.
         up: Axis of the files that points up. Default: as in `objects.library`.
 

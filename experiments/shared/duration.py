@@ -45,7 +45,8 @@ def plan(config: Config, *, num: int = 64, steps: int = 4) -> str:
 
     Args:
         config: Configuration of the experiment.
-        num: Number of simulated trajectories. The first and the last frame of each are rendered in all symmetries.
+        num: Number of simulated trajectories. The first and the last frame of each trajectory are rendered once for
+            each symmetry of the scenario.
         steps: Number of gradient steps of each model.
 
     Returns:

@@ -21,7 +21,7 @@ CORRECTABLE = (
 
 @contextlib.contextmanager
 def on_one_line(*, debug: bool = False) -> Iterator[None]:
-    """Report an error that the user can correct as one line, `error: ...`, and exit with code 1.
+    """If the user can correct an error, print `error: ...` on one line, and exit with code 1.
 
     Args:
         debug: If True, raise all errors unchanged, so that Python prints their tracebacks.

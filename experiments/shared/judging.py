@@ -23,8 +23,8 @@ MAIN_SUBSETS = (
 class SplitPairs(NamedTuple):
     """The first and last frames of a split.
 
-    `validation` and `given` have the resolution that the models require as inputs. `train` and `test` have images of
-    `image_size`.
+    The images of `validation` and `given` have the resolution of the models' inputs. The images of `train` and `test`
+    have the resolution `image_size`.
     """
 
     train: dataset.Pairs  # training trajectories
@@ -37,8 +37,8 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
     """Score every model on held-out trajectories, and write and return the results.
 
     The results are `metrics.json`, `table.md`, `table-full.md` and `figures/` in the work directory. `metrics.json`
-    records the checksums of all inputs and results. While all checksums match, nothing is evaluated again. Names of the
-    files of a further split contain its name.
+    records the checksums of all inputs and results. While all checksums match, nothing is evaluated again. If `split`
+    is not the first of `config.splits`, the names of the files contain the name of the split.
 
     Args:
         config: Configuration of the experiment.
@@ -157,7 +157,7 @@ def _scored(
 
 
 def main_rows(model: str, titles: Sequence[str]) -> list[str]:
-    """The titles of the rows of the main table: the ceiling, the baselines, and the main model with five inputs.
+    """Row titles of the main table: the ceiling, the baselines, and the main model with up to five sets of inputs.
 
     Args:
         model: Title of the main model.

@@ -125,9 +125,10 @@ class Live:
         Args:
             predictor: Trained model. Visual images must be among its inputs.
             views: Conversion from raw images to the view of the sensor.
-            outcomes: Names of the outcomes of the model's scenario, in the scenario's order. If their number does not
-                match the model's outcomes, they are numbered instead.
-            condition: Condition of the scenario, in SI units. An empty tuple stands for zeros.
+            outcomes: Names of the outcomes of the model's scenario, in the scenario's order. If the model predicts
+                another number of outcomes, the names are `outcome 0`, `outcome 1` and so on.
+            condition: Known quantities of the scenario that the model receives (SI units). An empty tuple stands for
+                zeros.
             show: Function that the thread calls after each prediction. The latency includes this call.
 
         Raises:
@@ -193,7 +194,10 @@ class Live:
 
     @property
     def latency_s(self) -> float | None:
-        """Median time from the arrival of an input's newer image until its prediction is shown (s), or None."""
+        """Median latency of the predictions (s), or None before the first prediction.
+
+        The latency is the time from the arrival of the newer of the two input images until the prediction is shown.
+        """
         with self._changed:
             return statistics.median(self._latencies_s) if self._latencies_s else None
 

@@ -13,7 +13,8 @@ from sts_jax import dataset, evaluation
 def draw_strip(path: Path, collection: dataset.Collection, sensor: sts.Sensor, data: dataset.Dataset) -> None:
     """Draw a fully rendered trajectory as a strip of pictures.
 
-    It is the first one whose outcome comes earliest in the scenario's list of outcomes.
+    The function draws the trajectory whose outcome comes earliest in the scenario's list of outcomes. If several
+    trajectories have this outcome, the first of them is drawn.
 
     Args:
         path: Path of the picture.
@@ -42,7 +43,7 @@ def draw_strip(path: Path, collection: dataset.Collection, sensor: sts.Sensor, d
 def views(body: sts.objects.Body, pose: np.ndarray, gravity: np.ndarray, sensor: sts.Sensor, wall: float) -> np.ndarray:
     """Render a trajectory from outside, with the final direction of gravity pointing down.
 
-    An object that has fallen off is not drawn after its pose is frozen.
+    An object that has fallen off the pad is drawn only while its pose changes.
 
     Args:
         body: The object.

@@ -120,9 +120,10 @@ def is_twin(recordings: hardware.Recordings) -> bool:
 
 
 def missing(config: Config, workdir: Path) -> int:
-    """The number of trajectories that the digital twin still has to collect.
+    """The number of trajectories that this command still has to collect with its own digital twin.
 
-    It is 0 if the work directory contains trajectories of a device or of a served twin.
+    The number is 0 if the trajectories in the work directory come from a device, or from a twin that
+    `python -m experiments.twin` ran as a separate program.
 
     Raises:
         OSError: `session.json` is damaged.
@@ -134,7 +135,7 @@ def missing(config: Config, workdir: Path) -> int:
 
 
 def samples(config: Config, count: int) -> int:
-    """The number of training samples from `count` trajectories, with shifted copies and images at rest."""
+    """The number of training samples from `count` trajectories, including the copies that `augmented` makes."""
     return round((1 - config.held_out) * count) * (1 + config.shifts) * (2 if config.rest else 1)
 
 
@@ -193,7 +194,7 @@ def jobs(config: Config, data: Recorded) -> Iterator[stages.Job]:
 
 
 def augmented(config: Config, images: np.ndarray, empty: np.ndarray) -> np.ndarray:
-    """Augment the training images of a stream by shifted copies, and by copies whose input is the final image.
+    """Add shifted copies to the training images of a stream, and pairs that have the final image twice.
 
     Args:
         config: Configuration of the experiment.

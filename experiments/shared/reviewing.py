@@ -89,7 +89,7 @@ def draw(folder: Path, numbers: tuple[int, ...], path: Path) -> None:
         path: Path of the picture.
 
     Raises:
-        ValueError: There is no confirmed trajectory at all, or none with one of the numbers.
+        ValueError: A number belongs to no confirmed trajectory, or the session has no confirmed trajectory.
     """
     recordings = hardware.load_recordings(folder)
     if unknown := set(numbers) - set(recordings.numbers):

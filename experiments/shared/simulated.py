@@ -71,7 +71,7 @@ class Hand(twin.Hand):
 def collect(config: Simulated) -> None:
     """Collect until there are enough trajectories, or continue an interrupted collection.
 
-    Trajectory n of the session is trajectory n of the scene. A continued collection therefore repeats none.
+    Trajectory n of the session is trajectory n of the scene. A continued collection therefore repeats no trajectory.
 
     Raises:
         ValueError: The work directory contains data of another sensor or with other options.

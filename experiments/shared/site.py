@@ -28,8 +28,8 @@ Image = UInt8[np.ndarray, "height width 3"]
 class Site(abc.ABC):
     """A web server with one page.
 
-    The server listens on one address only. It refuses requests for another host name, and actions without the page's
-    own header. Another site in the same browser can therefore neither see the images nor press the buttons.
+    The server listens on one address only. It refuses requests for another host name, and actions without the HTTP
+    header that the page sends. Therefore, another site in the same browser cannot see the images or press the buttons.
     """
 
     def __init__(self, host: str, port: int, document: Path, streams: tuple[str, ...]):
@@ -67,7 +67,7 @@ class Site(abc.ABC):
 
     @abc.abstractmethod
     def facts(self) -> dict[str, Any]:
-        """The content of the page besides images, for JSON. `ended` is True after the last change."""
+        """The content of the page besides images, for JSON. The entry `ended` is True if the program has ended."""
 
     @abc.abstractmethod
     def image(self, stream: str) -> Image | None:
@@ -106,12 +106,12 @@ class Site(abc.ABC):
         return time.monotonic() - self._asked_s < _OPEN_S
 
     def asked(self) -> dict[str, Any]:
-        """Note that a page requests the facts, and return them."""
+        """Record the time of a request for the facts, and return the facts."""
         self._asked_s = time.monotonic()
         return self.facts()
 
     def wait(self, last: int) -> int | None:
-        """Wait until there are more than `last` changes. Returns their number, or None after the last change."""
+        """Wait until the number of changes exceeds `last`. Returns this number, or None if the program has ended."""
         with self._changed:
             self._changed.wait_for(lambda: self._ended or self._number > last)
             return None if self._ended else self._number

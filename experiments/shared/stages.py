@@ -187,7 +187,8 @@ def run(
     Args:
         job: Model and data.
         folder: Folder of the model.
-        targets: Modalities that a model of the paper predicts from a subset: all, or only those of the subset ("own").
+        targets: Modalities that a model of the paper learns to predict from a subset of its inputs. "all": all
+            modalities. "own": only the modalities of the subset.
         progress: Function that receives the number of finished steps, the number of all steps, and values of the log.
     """
     training.save_blank(folder, job.empty["visual"], job.empty["tactile"])

@@ -16,7 +16,7 @@ class Terminal:
     """Shows views to a person at a terminal, and returns the person's actions (a `hardware.Person`).
 
     Enter confirms, d discards and q stops. If the standard input is not a terminal, each line acts like a key: an empty
-    line confirms, `d` discards and `q` stops. The end of the input stops, too.
+    line confirms, `d` discards and `q` stops. The end of the input has the same effect as `q`.
     """
 
     def __init__(self, count: int | None = None, *, keys: bool = True):

@@ -21,16 +21,16 @@ TITLE = "state-space model, simulated training"
 def predictions(config: Config, data: Recorded, workdir: Path) -> Predicted | None:
     """Predict the validation trajectories from both images of the held object.
 
-    The brightness and the colours of the images are first adapted to those of the model's training images
-    (`hardware.relit`). Those of the predictions are adapted back to the recorded sensor.
+    The brightness and the colours of the images are first adapted to the model's training images (`hardware.relit`).
+    The brightness and the colours of the predictions are then adapted back to the recorded images.
 
     Args:
         config: Configuration of the experiment.
-        data: Recorded trajectories, at the resolution of the table.
+        data: Recorded trajectories with images of `config.image_size`.
         workdir: Work directory from which the trajectories were read.
 
     Returns:
-        The predictions, or None if the model's images do not have the resolution of the table.
+        The predictions, or None if the model's images do not fit `config.image_size`.
     """
     predictor = sts.Predictor.load(NAME)
     side, (height, _) = config.image_size, predictor.preprocessing.resolution

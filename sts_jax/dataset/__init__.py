@@ -25,6 +25,7 @@ from sts_jax.dataset.meshes import survey_meshes as survey_meshes
 from sts_jax.dataset.records import Images as Images
 from sts_jax.dataset.records import write_arrays as write_arrays
 from sts_jax.dataset.rendering import empty_frame as empty_frame
+from sts_jax.dataset.rendering import frames_per_call as frames_per_call
 from sts_jax.dataset.rendering import render_uint8 as render_uint8
 
 __all__ = [
@@ -43,6 +44,7 @@ __all__ = [
     "class_names",
     "collect",
     "empty_frame",
+    "frames_per_call",
     "head",
     "load",
     "make_bodies",

@@ -1,4 +1,4 @@
-"""`Collection` describes a dataset. Functions derive from it the objects, their classes and their split."""
+"""The description of a dataset, `Collection`, and functions that make its objects, their classes and their split."""
 
 import dataclasses
 import math

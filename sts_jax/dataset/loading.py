@@ -1,6 +1,8 @@
 """Loading of a dataset as arrays: trajectories, rendered images, and pairs of first and last frames."""
 
+import concurrent.futures
 import dataclasses
+import os
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -74,37 +76,46 @@ def reduced(pairs: Pairs, size: int) -> Pairs:
     Raises:
         ValueError: The images are not square, or their side length is not a multiple of `size`.
     """
-    height, width = pairs.visual.shape[2:4]
-    if height != width or size < 1 or height % size:
-        raise ValueError(
-            f"size is {size}, but the images are {height} x {width} pixels: the images must be square, with a side "
-            "length that is a multiple of `size`"
-        )
-    return pairs._replace(
-        visual=_means(pairs.visual, size),
-        tactile=_means(pairs.tactile, size),
-        segmentation=_means(pairs.segmentation[..., None], size)[..., 0],
-    )
+    images = {"visual": pairs.visual, "tactile": pairs.tactile, "segmentation": pairs.segmentation[..., None]}
+    small = reduced_images(images, size)
+    return pairs._replace(visual=small["visual"], tactile=small["tactile"], segmentation=small["segmentation"][..., 0])
 
 
 def reduced_images(images: dict[str, np.ndarray], size: int) -> dict[str, np.ndarray]:
     """Reduce square images to a lower resolution. Each new pixel is the mean of a square block of pixels.
 
     Args:
-        images: Arrays of images by name, uint8 `(*n, side, side, channels)`. They may have any leading axes `*n`.
+        images: Arrays of images by name, uint8 or bool `(*n, side, side, channels)`. They may have any leading axes
+            `*n`.
         size: New side length of the images (pixels). It must divide the present side length.
 
     Returns:
-        The arrays of smaller images by name, uint8 `(*n, size, size, channels)`.
+        The arrays of smaller images by name, `(*n, size, size, channels)`, with the types of the given arrays. A bool
+        pixel is true if at least half of its block is true.
+
+    Raises:
+        ValueError: The images are not square, or their side length is not a multiple of `size`.
     """
+    for image in images.values():
+        height, width = image.shape[-3:-1]
+        if height != width or size < 1 or height % size:
+            raise ValueError(
+                f"size is {size}, but the images are {height} x {width} pixels: the images must be square, with a side "
+                "length that is a multiple of `size`"
+            )
     return {name: _means(image, size) for name, image in images.items()}
 
 
 def _means(images: np.ndarray, size: int) -> np.ndarray:
     """Means over blocks of pixels, rounded to the type of the images."""
     factor = images.shape[-2] // size
-    blocks = images.reshape(*images.shape[:-3], size, factor, size, factor, images.shape[-1])
-    return ((blocks.sum((-4, -2), dtype=np.uint32) + factor**2 // 2) // factor**2).astype(images.dtype)
+    # The smallest type that can hold the sum of a block. A sum of slices is many times as fast as `sum` over two axes.
+    kind = np.min_scalar_type(256 * factor**2)
+    total = np.full((*images.shape[:-3], size, size, images.shape[-1]), factor**2 // 2, kind)
+    for row, column in np.ndindex(factor, factor):
+        total += images[..., row::factor, column::factor, :]
+    total //= kind.type(factor**2)
+    return total.astype(images.dtype)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -146,7 +157,8 @@ class Dataset:
             np.empty((len(rows), height, width, 3), np.uint8),
             np.empty((len(rows), height, width), bool),
         )
-        for shard in np.unique(self.shard_of[rows]).tolist():
+
+        def read(shard: int) -> None:
             here = np.flatnonzero(self.shard_of[rows] == shard)
             part = records.read_images(
                 self.shards[shard],
@@ -156,6 +168,9 @@ class Dataset:
             )
             for whole, piece in zip(out, part, strict=True):
                 whole[here] = piece
+
+        with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+            list(pool.map(read, np.unique(self.shard_of[rows]).tolist()))
         return out
 
     def _records_in(self, shard: int) -> int:

@@ -2,7 +2,7 @@
 
 A shard is two files. `NAME.array_record` has one record per rendered frame: the visual image, the tactile image
 (`uint8`, `(height, width, 3)`) and the segmentation (bits), in that order. The frames are followed by one record per
-view, which has the visual image only. A view shows an object in an initial pose that is not simulated.
+view. A view is a visual image of an object in an initial pose, without a trajectory.
 
 `NAME.npz` contains all other data as named arrays. It is written last, and a shard without it counts as missing. It
 also contains the `Identity` of the shard and the SHA-256 of `NAME.array_record`. A reader therefore notices if one of

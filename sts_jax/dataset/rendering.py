@@ -1,4 +1,4 @@
-"""Rendering of the frames of a dataset: on all CPU cores, in the types of the stored images."""
+"""Rendering of the images of a dataset on all CPU cores, as `uint8` arrays and bool segmentations."""
 
 import concurrent.futures
 import functools
@@ -18,9 +18,8 @@ from sts_jax.dataset.symmetry import turn, turn_wrench
 from sts_jax.frame import sense
 from sts_jax.sensor import Sensor
 
-# Number of frames that one compiled call renders. The last call of an object is padded to this number.
-RENDER_BATCH = 32
-CPU_RENDER_BATCH = 8  # fewer, because a CPU renders the frames one after another
+RENDER_BATCH = 32  # value of `frames_per_call` on a GPU
+CPU_RENDER_BATCH = 8  # value on a CPU: fewer, because a CPU renders the frames one after another
 
 
 class _Job(NamedTuple):
@@ -62,7 +61,7 @@ def render(
         Batches of images in the order in which they are stored. A batch of frames has the visual images, the tactile
         images and the segmentations. A batch of views is a tuple with only the visual images.
     """
-    size = CPU_RENDER_BATCH if jax.default_backend() == "cpu" else RENDER_BATCH
+    size = frames_per_call()
     turned = {
         q: [np.asarray(f(jnp.asarray(x), q)) for f, x in ((turn, trajectory.pose), (turn_wrench, trajectory.wrench))]
         for q in symmetries_of(collection)
@@ -94,6 +93,11 @@ def render(
             done += len(images[0])
             report(done)
             yield images
+
+
+def frames_per_call() -> int:
+    """Number of frames for which the library calls `render_uint8`. Calls of equal size share one compiled program."""
+    return CPU_RENDER_BATCH if jax.default_backend() == "cpu" else RENDER_BATCH
 
 
 @functools.partial(jax.jit, static_argnames=("resolution", "crop"))
@@ -142,6 +146,8 @@ def empty_frame(sensor: Sensor, collection: Collection) -> records.Images:
         segmentation is false everywhere.
     """
     body = make_bodies(collection, np.array([0]))[0]
-    gone = jnp.array([[0.0, 0, -1, 1, 0, 0, 0]])
-    images = render_uint8(sensor, body, gone, jnp.zeros((1, 6)), resolution=collection.resolution, crop=collection.crop)
+    # The number of frames is that of `render`. After a collection, the program is therefore compiled already.
+    gone = np.tile(np.array([0, 0, -1, 1, 0, 0, 0], np.float32), (frames_per_call(), 1))
+    wrench = np.zeros((len(gone), 6), np.float32)
+    images = render_uint8(sensor, body, gone, wrench, resolution=collection.resolution, crop=collection.crop)
     return records.Images(*(np.asarray(leaf)[0] for leaf in images))

@@ -1,4 +1,4 @@
-"""The metrics of summaries and tables: METRICS, and the default columns of `table`."""
+"""The metrics of summaries and tables (METRICS), and the default columns of `table` (COLUMNS)."""
 
 import dataclasses
 import functools

@@ -1,10 +1,10 @@
 """Distances between real and simulated images: per pixel, in a feature space, and by a classifier.
 
-Every function compares two sides, a set of real and a set of simulated images. Images are uint8
-`(n, height, width, 3)` of one stream. Each image has a group number, which is the number of its trajectory.
+The distances compare a set of real images with a set of simulated images. Images are uint8 `(n, height, width, 3)` of
+one stream. Each image has a group number, which is the number of its trajectory.
 
-The sides are matched if both contain the same groups. Image i of one side and image i of the other then show the same
-object in the same pose. Sides that are not matched must have no group in common.
+The two sets are matched if both contain the same groups. Image i of one set and image i of the other then show the same
+object in the same pose. Sets that are not matched must have no group in common.
 """
 
 from typing import NamedTuple
@@ -129,9 +129,9 @@ def energy_distance(
     far apart. Each feature is first divided by its standard deviation over both sets. If this deviation is below one
     grey level (1/255), the feature is divided by one grey level instead.
 
-    The three means are only over pairs of images from different trajectories. Therefore, the number of images
-    causes no bias, and neither do trajectories that occur in both sets. For equal distributions, the estimate
-    varies around 0 and may be negative.
+    The three means use only pairs of images from different trajectories. The number of images therefore causes no
+    bias. Trajectories that occur in both sets also cause no bias. For equal distributions, the estimate varies around
+    0 and may be negative.
 
     The p-value comes from a permutation test. If both sets have the same trajectories, a permutation exchanges the real
     and the simulated images of randomly selected trajectories. If they have no common trajectory, a permutation
@@ -278,7 +278,7 @@ def _check(real: np.ndarray, simulated: np.ndarray, real_group: np.ndarray, simu
 def _matched(
     real: np.ndarray, simulated: np.ndarray, real_group: np.ndarray, simulated_group: np.ndarray, *, least: int = 2
 ) -> bool:
-    """Return whether the sides are matched, or raise an error for invalid features and groups."""
+    """Return whether the two sets are matched, or raise an error for invalid features and groups."""
     for name, values, group in (("real", real, real_group), ("simulated", simulated, simulated_group)):
         if values.ndim != 2 or group.shape != values.shape[:1]:
             raise ValueError(

@@ -1,4 +1,4 @@
-"""Evaluation of predicted last images of both streams without poses, for recordings of a real sensor."""
+"""Evaluation of predicted last images of both streams. Poses are not needed, so real recordings can be used."""
 
 from collections.abc import Mapping
 from typing import Protocol, runtime_checkable

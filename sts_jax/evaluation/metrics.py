@@ -5,7 +5,7 @@ Errors are arrays with one number per item. Means over items accept weights of t
 Predicted images are probabilities p, and the true images (targets) are grey values x, both in [0, 1]. The binary
 cross-entropy of a value is `BCE(x, p) = -x log p - (1 - x) log(1 - p)`. Its minimum is the entropy H(x) of the target:
 `BCE(x, p) = H(x) + KL(x || p)`. The excess is the divergence KL(x || p), which is 0 for a perfect prediction. The skill
-is 1 minus the ratio of the excess to that of the mean training image.
+is `1 - excess / constant_excess`, where `constant_excess` is the excess of the mean training image.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,7 +18,7 @@ HALF_LEVEL = 1 / 510
 FLOOR = 1e-3  # least probability of an outcome in the log loss, to which smaller ones are raised
 BINS = 10  # number of bins of equal width in [0, 1], for the calibration of outcome probabilities
 LEVEL = 0.9  # probability of the region whose coverage is measured
-_CHUNK = 128  # number of items whose images are compared at once, which limits the memory
+_CHUNK = 8  # number of items whose images are compared at once: few, so that the arrays fit into the cache of a CPU
 _CLOSE = 1e-6  # m, least distance in the weights of the geometric median, which keeps them finite
 
 

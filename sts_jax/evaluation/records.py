@@ -100,9 +100,7 @@ class Metric:
 
     def __post_init__(self) -> None:
         if not self.name:
-            raise ValueError(
-                "name of a metric is empty: give the name that it has in summaries, such as 'height_error'"
-            )
+            raise ValueError("name of a metric is empty: give a name for the summaries, such as 'height_error'")
         if self.errors is None and self.statistic is None:
             raise ValueError(
                 f"metric {self.name!r} has neither `errors` nor `statistic`: give a function for at least one"

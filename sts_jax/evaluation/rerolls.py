@@ -22,7 +22,6 @@ from sts_jax.physics.scenario import Shape, Start
 from sts_jax.physics.simulation import ATTEMPTS
 from sts_jax.sensor import Sensor
 
-RENDER_BATCH = 32  # frames rendered by one compiled call
 _SAME = 1e-4  # largest difference between the first poses of a re-roll and its item (m, or entries of a quaternion)
 
 
@@ -124,7 +123,7 @@ def _replayed(
         """A scenario whose first poses are given instead of drawn."""
 
         def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-            """The start of the body with this key. Its pose is NaN if no body has the key."""
+            """The start of the body whose trajectory has this random key. The pose is NaN if no body has the key."""
             del shape, pad
             same = (jnp.asarray(known) == jax.random.key_data(key)).all(-1)
             mine = jnp.asarray(body)[jnp.argmax(same)]
@@ -147,15 +146,15 @@ def _drawn(
 
     The images have the resolution of the collection. They are reduced to `size` if its height is not `size`.
     """
-    same = size == collection.resolution[0]
+    same, batch = size == collection.resolution[0], dataset.frames_per_call()
     jobs = [
-        np.flatnonzero(owner == index)[start : start + RENDER_BATCH]
+        np.flatnonzero(owner == index)[start : start + batch]
         for index in range(len(bodies))
-        for start in range(0, int((owner == index).sum()), RENDER_BATCH)
+        for start in range(0, int((owner == index).sum()), batch)
     ]
 
     def work(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        padded = np.pad(rows, (0, RENDER_BATCH - len(rows)), "edge")
+        padded = np.pad(rows, (0, batch - len(rows)), "edge")
         images = dataset.render_uint8(
             sensor,
             bodies[owner[rows[0]]],

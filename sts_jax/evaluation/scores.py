@@ -36,9 +36,9 @@ def score(
 ) -> Scores:
     """Compute the errors of a predictor, for each held-out trajectory (item).
 
-    The predicted outcome follows from the probabilities of the outcomes, if the prediction has them and `frequency` is
-    given. It is the outcome with the largest ratio of probability to frequency. This decision has the best expected
-    balanced accuracy, in which a rare outcome counts as much as a common one.
+    If the prediction has outcome probabilities and `frequency` is given, the predicted outcome is the outcome with the
+    largest ratio of probability to frequency. This choice has the best expected balanced accuracy, in which a rare
+    outcome counts as much as a common one.
 
     Args:
         predicted: The prediction of all items, or of the first ones only.

@@ -13,7 +13,7 @@ def train_share(shares: Sequence[float], split: str) -> float:
     Args:
         shares: Shares of the objects for training, validation and test, `Collection.shares`.
         split: `object` if whole objects are held out, `trajectory` if single trajectories are held out. As in the
-            paper, a split by trajectory has no validation part, and the training part also gets the validation share.
+            paper, a split by trajectory has no separate validation part. The validation share is used for training.
     """
     return shares[0] if split == "object" else 1 - shares[2]
 

@@ -23,7 +23,7 @@ class Connection:
     """An open serial port to the LED controller. Several threads may use one connection."""
 
     def __init__(self, name: str, baud: int):
-        """Open the port. `ports.open_port` lists the errors.
+        """Open the port. The errors are those of `ports.open_port`.
 
         Args:
             name: Name of the device, or a URL of pyserial.

@@ -92,10 +92,9 @@ class AutomaticPerson:
         self._stage = view.stage
 
     def action(self) -> Action | None:
-        """Return `Action.CONFIRM` in the stage `REVIEW`, and None in every other stage.
+        """Return `Action.CONFIRM` if the latest view that `show` received has the stage `REVIEW`, otherwise None.
 
-        The stage is the stage of the latest view that `show` received. In the stage `REVIEW`, a recorded trajectory is
-        confirmed or discarded.
+        In the stage `REVIEW`, a recorded trajectory is confirmed or discarded.
         """
         return Action.CONFIRM if self._stage is Stage.REVIEW else None
 

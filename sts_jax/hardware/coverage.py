@@ -35,7 +35,7 @@ def view_angle(lens: Lens, pinhole: Pinhole) -> float:
 
 
 def check_view(lens: Lens, pinhole: Pinhole, largest_angle: float | None = None) -> None:
-    """Raise an error unless the camera sees the whole view and the calibration images cover the corners of the view.
+    """Check that the camera sees the whole view and that the calibration images cover the corners of the view.
 
     The view is the part of the gel's outer face that rectified images show.
 
@@ -43,8 +43,8 @@ def check_view(lens: Lens, pinhole: Pinhole, largest_angle: float | None = None)
         lens: The lens and the pose of the real camera.
         pinhole: The simulated pinhole camera that defines the view, such as `Sensor.camera`.
         largest_angle: `Calibration.largest_angle`, the largest angle from the optical axis at which the calibration
-            images show a corner of the board (rad). The corners of the view may be up to 3 degrees farther from the
-            optical axis. None: this angle is not checked.
+            images show a corner of the board (rad). The angles of the corners of the view may be up to 3 degrees
+            larger. None: this angle is not checked.
 
     Raises:
         CalibrationError: A part of the view lies outside of the camera's image. Or a corner of the view is more than

@@ -1,6 +1,6 @@
 """A software emulation of the LED controller: it answers lines of the protocol, on a clock that the caller supplies.
 
-The tests compare its answers with the answers of the firmware, which they run in a simulator of the chip.
+The tests run the firmware in a simulator of the chip, and compare the firmware's answers with the emulated answers.
 """
 
 from sts_jax.hardware import protocol

@@ -212,8 +212,8 @@ class VideoFilm(Film):
 
         Raises:
             CameraError: A file is missing, damaged or not a video.
-            ValueError: The lengths differ by more than one frame, `fps` is not positive and finite, or a path is
-                that of a device or a stream.
+            ValueError: The lengths differ by more than one frame, `fps` is not positive and finite, or a path
+                names a device or a stream.
         """
         if fps is not None and not (fps > 0 and math.isfinite(fps)):
             raise ValueError(f"fps must be > 0 and finite, got {fps}")

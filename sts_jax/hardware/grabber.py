@@ -213,7 +213,7 @@ class Grabber:
                 self._changed.wait(remaining)
 
     def latest(self) -> Captured:
-        """Return the newest frame. After the end of a video file, this is its last frame.
+        """Return the newest frame. After the end of a video file, the newest frame is the last frame of the file.
 
         Raises:
             CameraError: There are no frames at present. See `Camera.read` for the subclasses of this error.
@@ -468,7 +468,7 @@ class _Playback:
         return max(due - time.monotonic(), 0.0)
 
     def late(self) -> bool:
-        """Return whether the frame after the current one is due too. If so, advance to it."""
+        """Return whether the frame after the current frame is already due. If so, advance to that frame."""
         last = self._frames is not None and self._number >= self._frames
         if not self.realtime or last or time.monotonic() < self._start + self._number * self._period:
             return False
@@ -476,7 +476,7 @@ class _Playback:
         return True
 
     def end(self) -> _Problem:
-        """Return the reason for no further frames at the end of the file."""
+        """Return the reason why there are no more frames after the end of the file."""
         return _Problem(
             EndOfVideoError,
             f"{self._config.name} has ended (its header states {self._frames} frames): call disconnect(), then "

@@ -3,10 +3,10 @@
 The guide is a pure function of a state and a pair of images, and needs no devices. The person places an object on the
 pad and holds it (stages `PLACE` and `HOLD`), releases it (`RELEASE`), and waits until it rests (`STILL`).
 
-Each image is divided into 24 rows of 32 blocks, and movements are detected in the means of these blocks, in which the
-noise of single pixels averages out. A contact can be as small as one of these blocks. Contacts are therefore detected
-in blocks of half the width and height. A block has changed if its mean differs by more than a threshold, which is a
-multiple of the noise of this mean on the empty pad.
+Each image is divided into 24 rows of 32 blocks. A movement is a change of a block's mean colour between two images. The
+noise of single pixels averages out in this mean. A contact is a difference of a mean from the empty pad. A contact can
+be as small as one block. Contacts are therefore detected in blocks of half the width and height. Only changes and
+differences above a threshold count. The threshold is a multiple of the noise of the mean on the empty pad.
 """
 
 import dataclasses
@@ -153,8 +153,8 @@ def empty_pad(observations: Sequence[Observation]) -> EmptyPad:
 
     An observation contains the mean colours of blocks of the images, see `observe`. The mean colour of a block varies
     from observation to observation, and the standard deviation of this variation is the noise of the block. A few
-    observations can underestimate the noise. If the measured noise of a block is below the median of all blocks of the
-    same size in the same stream, the median is therefore returned.
+    observations can underestimate the noise. The returned noise of a block is therefore at least the median noise of
+    all blocks of the same size in the same stream.
 
     Args:
         observations: At least two observations of the empty pad without movement.

@@ -1,4 +1,4 @@
-"""Control of the sensor's lights through its LED controller, with proof that they did not change meanwhile."""
+"""Control of the sensor's lights through its LED controller, with proof that no light changed between two requests."""
 
 import contextlib
 import dataclasses

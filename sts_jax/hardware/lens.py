@@ -1,8 +1,8 @@
 """The model of a real sensor's fisheye lens, and the conversion of its images to the simulated sensor's pinhole view.
 
-Pixel coordinates are (column, row). The centre of a pixel has whole numbers. A *raw* image comes from the camera. A
-*rectified* image shows the view of the simulated sensor's pinhole camera. A raw pixel and a rectified pixel correspond
-if their rays meet the gel's outer face (z = 0 in the sensor frame) in the same point.
+Pixel coordinates are (column, row). The coordinates of a pixel's centre are whole numbers. A *raw* image comes from the
+camera. A *rectified* image shows the view of the simulated sensor's pinhole camera. A raw pixel and a rectified pixel
+correspond if their rays meet the gel's outer face (z = 0 in the sensor frame) in the same point.
 """
 
 import dataclasses

@@ -32,7 +32,7 @@ def header(width: int, height: int, encoding: str) -> bytes:
 def cluster(time_ms: int, image: bytes) -> bytes:
     """Return the bytes that append one image to a Matroska video file. The format calls these bytes a cluster.
 
-    The last bytes are the encoded image.
+    The returned bytes end with the encoded image.
 
     Args:
         time_ms: Time of the image since the start of the file (ms).

@@ -64,7 +64,7 @@ def find_controllers() -> list[Port]:
     The LED controller may be on any of them. No port is opened, because opening a port restarts most boards.
 
     Returns:
-        The ports, those of USB devices first.
+        The ports. The ports of USB devices come first.
     """
     found = [
         Port(port.device, port.description or "", port.serial_number or None, port.vid, port.pid)

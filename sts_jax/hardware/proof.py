@@ -59,7 +59,7 @@ class ProvenFrames:
             levels: Duty cycles of the four channels in the tactile stream, 0 to 255.
             exposures: Exposures of the visual and of the tactile stream, in the unit of the camera's driver. They are
                 set only if they differ. None: not changed.
-            timeout_s: Longest wait for one frame while the frames after a switch are collected (s).
+            timeout_s: Longest wait for a frame in `measure_settling` and `see_both`, and before a repeated switch (s).
             reconnect_s: Longest search for a controller that was lost (s).
         """
         self._camera, self._leds = camera, leds
@@ -166,8 +166,8 @@ class ProvenFrames:
     def pair(self, deadline: float) -> Pair:
         """Take a visual and a tactile image. The frames of both images arrive after the start of this call.
 
-        The first image is of the stream for which the lights are already set, so the lights are switched only once for
-        a pair.
+        The method begins with the stream for which the lights are already set. The lights are therefore switched only
+        once for a pair.
 
         Args:
             deadline: Latest time on the clock `time.monotonic` (s). If the LED controller is lost during the call,

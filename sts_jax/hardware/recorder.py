@@ -5,7 +5,8 @@ A recording is a folder:
     recording.json    version of the format, encoding, and identity of the sensor
     visual.mkv        images without light, as a Matroska video that other programs can play
     tactile.mkv       images with light, as a Matroska video
-    frames.jsonl      one line for each image: time, proof of the light, and position in the video file
+    frames.jsonl      one line for each image: its time, its position in the video file, and the period in which the
+                      lights did not change
     sensor.json       a copy of the sensor file, with copies of its background images, if there is one
 
 Each image is written before its line in frames.jsonl. After an interruption at any time, each complete line therefore
@@ -76,7 +77,7 @@ class Recorder:
         """Create the folder and write `recording.json`.
 
         Args:
-            folder: Folder of the recording. It must be empty, or it is created.
+            folder: Folder of the recording. A missing folder is created. An existing folder must be empty.
             origin: Identity of the sensor.
             settling: Settling times of the sensor's lights, which are stored with the recording. None: not stored.
             encoding: "png" is lossless. "jpeg" (quality 95, full colour resolution) needs about a fifth of the space.

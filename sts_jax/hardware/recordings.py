@@ -338,7 +338,7 @@ def encoded_pair(pair: Pair, settling: Settling | None) -> dict[str, bytes]:
     """Encode a pair of images as the files `visual.png`, `tactile.png` and `pair.json`.
 
     Args:
-        pair: The two images. Each comes with the start and the end of a period in which the lights did not change.
+        pair: The two images, each with the times between which the lights did not change.
         settling: Settling times of the sensor's lights, which are stored in `pair.json`. None: not stored.
 
     Returns:

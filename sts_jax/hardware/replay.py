@@ -56,8 +56,8 @@ class Replay:
         Args:
             source: Folder of a recording that `Recorder` wrote, or the paths of two video files, the visual stream
                 first. Frames of the two videos with the same number form a pair, so the videos must have the same
-                length (a difference of one frame is allowed). Videos contain no proof of the light, so all times in
-                `Shot.before` and `Shot.until_s` are NaN.
+                length (a difference of one frame is allowed). Video files do not store when the lights changed, so
+                all times in `Shot.before` and `Shot.until_s` are NaN.
             speed: Seconds of the recording that are played per second, > 0. None: as fast as the program reads,
                 without missing images.
             loop: If True, the replay starts again at the end, and `Shot.epoch` continues to increase. If False, reading

@@ -1,4 +1,4 @@
-"""Locking of exposure, gain, white balance and focus: set through OpenCV, read back, and compared."""
+"""The locking of exposure, gain, white balance and focus. The values are set through OpenCV, read back and checked."""
 
 import dataclasses
 from collections.abc import Mapping

@@ -107,8 +107,8 @@ def light_share(look: Thumbnail, dark: Thumbnail, lit: Thumbnail) -> float:
 def switched_share(look: Thumbnail, before: Thumbnail, change: Thumbnail) -> float:
     """Return how far the lights had been switched on or off when an image was taken: 0 means not yet, 1 means fully.
 
-    A thumbnail value counts as visible if its change has a magnitude of at least 0.5 (of 255). It counts as clear if
-    this magnitude is also at least a quarter of the median magnitude of all visible values. The result is the median of
+    A value of `change` counts as visible if its magnitude is at least 0.5 (of 255). A visible value counts as clear if
+    its magnitude is at least a quarter of the median magnitude of all visible values. The result is the median of
     `(look - before) / change` over the clear values. Because of the median, an object that moves in less than half of
     the view has no influence.
 
@@ -119,7 +119,7 @@ def switched_share(look: Thumbnail, before: Thumbnail, change: Thumbnail) -> flo
 
     Returns:
         0 if the image shows the lights before the switch, and 1 if it shows the lights after the switch. The result is
-        also 0 if the switch changes no value clearly.
+        also 0 if no value of `change` is visible.
     """
     effect = np.abs(change)
     visible = effect >= _VISIBLE
@@ -160,9 +160,9 @@ def settling(on: Sequence[Switch], off: Sequence[Switch], period_s: float) -> Se
 def last_mixed(switch: Switch, dark: Thumbnail, lit: Thumbnail) -> float:
     """Return the time from the acknowledgement of a switch to the arrival of the last frame that is not settled (s).
 
-    The function `light_share` returns 0 for a frame like `dark` and 1 for a frame like `lit`. A frame is settled if
-    this value differs by at most 0.02 from the value of the last frame in `switch`. If all frames are settled, the
-    result is 0. The result is never negative.
+    The `light_share` of a frame is 0 for a frame like `dark` and 1 for a frame like `lit`. A frame is settled if its
+    `light_share` differs by at most 0.02 from the `light_share` of the last frame in `switch`. If all frames are
+    settled, the result is 0. The result is never negative.
 
     Args:
         switch: The frames after a switch of the lights.

@@ -1,4 +1,4 @@
-"""`Shot` and `Pair`: images that are proven to show the lights of their stream, and two errors."""
+"""`Shot` and `Pair`: images with the times between which the lights did not change. The module also has two errors."""
 
 import dataclasses
 from typing import Literal

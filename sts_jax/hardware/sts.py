@@ -88,8 +88,8 @@ class STS:
                 frames are discarded for the settling time. None: `connect` measures the settling times, which needs a
                 scene at rest.
             exposures: Exposures of the visual and of the tactile stream, in the unit of the camera's driver. If they
-                differ, the camera must be a device, and the exposure is set at each switch of the lights. Equal
-                exposures are not set: give such a value in `CameraConfig.exposure`. None: not changed.
+                differ, the camera must be a device, and the exposure is set at each switch of the lights. If they are
+                equal, `STS` does not set them: use `CameraConfig.exposure` instead. None: not changed.
             timeout_s: Longest wait for one image (s), not counting the time of a reconnection.
             reconnect_s: Longest search for a controller that was lost (s).
 

@@ -1,8 +1,8 @@
 """Convolutions and transposed convolutions with gradients that are fast on a CPU.
 
-XLA's CPU backend is slow for convolutions with `lhs_dilation`. JAX computes transposed convolutions and the gradients
-of strided convolutions in this way. The functions below use matrix products and convolutions without dilation instead.
-For small images and stride 1, a Fourier transform also saves most of the multiplications.
+XLA's CPU backend is slow for convolutions with `lhs_dilation`. JAX uses `lhs_dilation` for transposed convolutions and
+for the gradients of strided convolutions. The functions below use matrix products and convolutions without dilation
+instead. For small images and stride 1, a Fourier transform also saves most of the multiplications.
 
 Images have shape `(batch, height, width, channel)`. Kernels have shape `(size, size, in, out)`, and `size` must be a
 multiple of `stride`.

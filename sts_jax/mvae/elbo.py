@@ -1,6 +1,7 @@
-"""The training loss of the MVAE, a time-lagged evidence lower bound over subsets of the modalities, and predictions.
+"""The training loss and the predictions of the MVAE.
 
-The model sees inputs `x_t` at the time t and predicts targets `x_T` at a later time T. Training minimises
+The loss is a negative time-lagged evidence lower bound, summed over subsets of the modalities. The model sees inputs
+`x_t` at the time t and predicts targets `x_T` at a later time T. Training minimises
 
 `L(x_t, x_T) = sum_X [ sum_{m in asked(X)} lambda_m E_{q(z | X_t)} E_m(x_T, z) + beta KL(q(z | X_t) || N(0, I)) ]`
 
@@ -13,9 +14,10 @@ The model sees inputs `x_t` at the time t and predicts targets `x_T` at a later 
   channels), or the mean squared error of the components of a vector. `lambda_m` is `Modality.weight`.
 - `beta` weights the divergence.
 
-If a sample has no input of a subset, the subset does not count for this sample. Its posterior would be the prior.
-Decoders that have to predict the target from a random `z` learn to mix the mean target into every prediction. A sample
-without any input keeps all subsets, because the mean target is then the right prediction.
+If a sample has inputs, but none from the modalities of a subset, the loss of this sample omits the subset. The
+posterior of the subset would be the prior, and `z` would be random. Decoders that predict targets from a random `z`
+learn to mix the mean target into every prediction. If a sample has no input at all, its loss keeps all subsets, because
+the mean target is then the right prediction.
 """
 
 from typing import Literal, NamedTuple
@@ -85,8 +87,8 @@ def loss(
     predicts the targets from the inputs of the modalities in the subset.
 
     The `absent` modalities are removed from all subsets. If several subsets are then equal, the term of one subset is
-    computed and multiplied by the number of equal subsets. A modality that is masked in every sample gives the same
-    loss, but takes more time.
+    computed and multiplied by the number of equal subsets. If the mask of a modality in `present` is False for all
+    samples, the loss is the same as with the modality in `absent`, but the computation takes longer.
 
     For each modality, one call of the decoder predicts the targets for all subsets. Batch normalisation computes one
     mean and one variance of each channel for this call. As in the loss, n equal subsets count n times in this

@@ -57,13 +57,13 @@ def check_materials(path: Path, images: Path | None, strict: bool) -> None:
     missing = [str(path.parent / name) for name, file in files.items() if file is None]
     if missing and strict:
         raise FileNotFoundError(
-            f"{path}: the mesh refers to missing files: {', '.join(missing)}. Add these files, or give an image as "
-            "texture="
+            f"{path}: the mesh refers to missing files: {', '.join(missing)}. Add these files, or give an image "
+            "(argument texture)"
         )
     if missing:
         warnings.warn(
             f"{path}: colours are missing, because the mesh refers to missing files: {', '.join(missing)}. Add these "
-            "files, or give an image as texture=",
+            "files, or give an image (argument texture)",
             stacklevel=3,
         )
     for file in files.values():

@@ -124,15 +124,16 @@ def load(
         The body.
 
     Raises:
-        FileNotFoundError: The file or the texture does not exist. With `strict`, also for a missing material or image.
+        FileNotFoundError: The file or the texture does not exist, or `strict` is True and a material or an image of an
+            OBJ file is missing.
         ImportError: A package for the decimation or the decomposition of the mesh is needed and not installed.
         IsADirectoryError: The path is a folder.
         PermissionError: The file is not readable.
-        ValueError: The file is empty, truncated or not a mesh, or an image cannot be read. The mesh is flat, lacks
-            faces or has too many, or has a vertex that is not finite. Its longest side is above 0.15 m or below 5 mm.
-            It lacks the texture coordinates that `texture` needs. With `strict`, the mesh is not closed or encloses no
-            volume. The mesh cannot be decimated to `faces`, or cannot be decomposed into convex parts. An argument is
-            out of range.
+        ValueError: The file is empty, truncated or not a mesh, or an image cannot be read. The mesh is flat, has no
+            faces or too many faces, or has a vertex that is not finite. Its longest side is above 0.15 m or below 5 mm.
+            The mesh lacks the texture coordinates that `texture` needs. `strict` is True, and the mesh is not closed or
+            encloses no volume. The mesh cannot be decimated to `faces`, or cannot be decomposed into convex parts. An
+            argument is out of range.
     """
     path = Path(path)
     _check_arguments(path, longest_side, scale, largest, mass, density, faces, category)
@@ -289,7 +290,7 @@ def _factor(
             "the unit of the file, and give longest_side (in metres), or give scale (in metres per unit)"
         )
     if largest is not None and extent > largest:
-        warnings.warn(f"{path}: the longest side is {extent:.3g} m, scaled down to {largest} m", stacklevel=3)
+        warnings.warn(f"{path}: the longest side of {extent:.3g} m is scaled down to {largest} m", stacklevel=3)
         return factor * largest / extent
     if extent > PAD:
         raise ValueError(

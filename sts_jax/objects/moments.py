@@ -23,7 +23,7 @@ def solid_moments(
     Args:
         triangles: Corners of the triangles (m).
         reference: Reference point (m), by default the origin. For a solid that is clipped by a plane, give a point on
-            the plane. The cut face needs no triangles, because all its tetrahedra then have no volume.
+            the plane. `triangles` can then omit the cut face, because a tetrahedron on this face has no volume.
 
     Returns:
         Integrals of 1, x, y, z, xx, yy, zz, xy, xz and yz over the tetrahedron of each triangle. Coordinates are

@@ -1,7 +1,7 @@
 """Procedural objects: the registry of families, and `make`, which generates an object of a family from a random key.
 
-A family is a class of objects, such as bottles, and is a module of `objects.families`. It builds the parts of an object
-with `objects.shapes` and `objects.colors`, on the host and in millimetres.
+A family is a class of objects, such as bottles. Each family has a module in `objects.families`. The module builds the
+parts of an object with `objects.shapes` and `objects.colors`, on the host and in millimetres.
 """
 
 import dataclasses
@@ -107,8 +107,8 @@ def make(key: PRNGKeyArray, category: str | Family) -> Body:
             `Family` (see `find_family`).
 
     Returns:
-        A body whose +z axis points up in its usual pose. A body of one of CATEGORIES has a longest side of 50 to 130
-        mm. The arrays of its vertices and faces have 1,024 rows, including padding.
+        A body whose +z axis points up in its usual pose. If the category is one of CATEGORIES, the longest side of the
+        body is 50 to 130 mm, and the arrays of its vertices and faces have 1,024 rows, including padding.
 
     Raises:
         TypeError: `key` is not a JAX key.

@@ -1,8 +1,9 @@
 """The pinhole camera below the gel, and the part of its view that an image shows.
 
-A window is this part, as a rectangle `(left, top, width, height)` in metres on the gel's outer face (z = 0). Left is
-its smallest x, and top is its smallest y, because x points to the right of the image and y points down. The optical
-axis is perpendicular to this face. The cost of an image depends on its number of pixels and not on the window.
+A window is the rectangle `(left, top, width, height)` in metres on the gel's outer face (z = 0) that an image shows. In
+the image, x points to the right and y points down. `left` is therefore the smallest x of the window, and `top` is its
+smallest y. The optical axis is perpendicular to the gel's outer face. The cost of an image depends on its number of
+pixels and not on the window.
 """
 
 import dataclasses

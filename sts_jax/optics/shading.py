@@ -1,6 +1,6 @@
 """Shading of the view through the skin: the lit object, its shadow on the skin, and the haze of the translucent gel.
 
-All light is linear, and `to_srgb` is the last step of an image. Arguments of shape `*n` may have any shape.
+All light is linear. As the last step, `to_srgb` converts an image to sRGB. Arguments of shape `*n` may have any shape.
 """
 
 import dataclasses
@@ -223,8 +223,8 @@ def empty_view(
         room: Constants of the external light.
         square_radius: Squared distance from the pad's centre on the gel's face, `(2 x / width)^2 + (2 y / height)^2`
             with the width and height of the pad. It is 1 at the middle of each edge.
-        walls: Brightness of the housing's walls relative to the pad, as a ratio of sRGB values, from `housing`. This
-            function squares the ratio to approximate the ratio of linear light.
+        walls: Brightness of the housing's walls relative to the pad, from `housing`, as a ratio of sRGB values.
+            `empty_view` squares the ratio to approximate the ratio of linear light.
         hidden: Share of the sky that the object hides, from `hidden_sky`. Zeros give the view of the empty sensor.
 
     Returns:

@@ -1,7 +1,7 @@
 """A z-buffer in plain JAX: the nearest face at each pixel, for triangles of any size on the screen.
 
-Every face is cut into rows of pixels, and long rows into runs of a few pixels. A loop processes the runs in chunks and
-draws one pixel of each run of a chunk at a time. The work therefore grows with the number of covered pixels and not
+Every face is cut into rows of pixels, and long rows into runs of a few pixels. A loop processes the runs in chunks.
+Each step draws one pixel of every run in a chunk. The work therefore grows with the number of covered pixels and not
 with the product of faces and pixels. Each step is one scatter-min of 32-bit keys, with the depth in the high bits and
 the index of the face in the low bits. The choice of the face has no gradient. Values that are interpolated on the
 chosen face have gradients.

@@ -37,7 +37,7 @@ def check_arguments(bodies: Sequence[Any], sensor: Any, scenario: Any, **counts:
         if not whole or count < 1:
             raise ValueError(f"{name} is {count!r}, but it must be a whole number >= 1")
     if not bodies:
-        raise ValueError("no body was given: pass one Body or a sequence of at least one")
+        raise ValueError("no body was given: pass one Body or a sequence of bodies")
     if not isinstance(sensor, Sensor):
         raise TypeError(f"sensor is {sensor!r}, but it must be a Sensor, for instance sts.Sensor()")
     if not isinstance(scenario, Scenario) or not _is_frozen(scenario):

@@ -35,8 +35,8 @@ def check_bodies(bodies: Sequence[Any]) -> None:
 
     Raises:
         TypeError: An item is not a `Body`.
-        BodyError: `hulls` has a shape that the simulation does not support, or a value that is not finite. Or
-            `shell_mass` is 0, negative or not finite. Or `Body.check` finds an error.
+        BodyError: `hulls` has an unsupported shape or a non-finite value, `shell_mass` is not positive and finite, or
+            `Body.check` finds an error.
     """
     for i, body in enumerate(bodies):
         if not isinstance(body, Body):
@@ -117,8 +117,8 @@ def shapes(bodies: Sequence[Body], scenario: Scenario) -> Shape:
         scenario: Scenario in which the bodies are to start.
 
     Returns:
-        Arrays with a leading axis of bodies. They are padded where a body has fewer vertices, or fewer faces on which
-            it can rest, than another body.
+        Arrays with a leading axis of bodies. Bodies can differ in the number of vertices and in the number of faces on
+            which they can rest. Shorter arrays are padded to the longest.
 
     Raises:
         BodyError: A body cannot start in the scenario.

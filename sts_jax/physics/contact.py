@@ -1,8 +1,9 @@
 """Contacts of convex hulls with the top and the sides of a box: exact candidates, and the points chosen from them.
 
-MJX's own collision test of a mesh with a box is unsuitable here. It also tests every pair of edges. The edges of a
-small object on a large pad then have contacts with the distant rims of the pad. These contacts push the object, which
-never comes to rest or is even thrown off. MJX would also compile its test again for every mesh.
+MJX's own collision test of a mesh with a box is unsuitable here. MJX tests every edge of the mesh with every edge of
+the box. The edges of a small object on a large pad then have contacts with the distant rims of the pad. These contacts
+push the object. The object then never comes to rest, or is thrown off. MJX would also compile its test again for every
+mesh.
 
 The pad and the stop wall of the slope are boxes whose sides are parallel to the axes. Their contacts with a convex hull
 are therefore of three kinds:
@@ -12,8 +13,8 @@ are therefore of three kinds:
 - A corner of the top lies inside the hull. The hull is pushed along the normal of the nearest of its lower faces.
 
 The distance of each contact is exact along its normal. A fourth kind is left out: an edge of the hull that crosses an
-upright edge of the box below the top. Only objects that have fallen off the pad meet these edges, and they pass through
-them. The tests compare the contacts with those of a mesh in C MuJoCo.
+upright edge of the box below the top. Only objects that have fallen off the pad meet the upright edges. The edges of
+these objects pass through the upright edges. The tests compare the contacts with those of a mesh in C MuJoCo.
 """
 
 from typing import NamedTuple
@@ -47,7 +48,10 @@ class Hull(NamedTuple):
 
 
 class Contacts(NamedTuple):
-    """k contact points in the sensor frame. The fields have the same meaning as in MuJoCo's `mjContact`."""
+    """k contact points. The fields have the same meaning as in MuJoCo's `mjContact`.
+
+    `collide` returns the points in the frame of the box's top. `scene.step` needs the points in the sensor frame.
+    """
 
     dist: Float[Array, "k"]  # m, negative for penetration, 1 where there is no contact
     pos: Float[Array, "k 3"]  # m, halfway between the two surfaces

@@ -36,8 +36,9 @@ class Inclined(Scenario):
     """An object starts at rest on the tilted pad, or is released just above it. Downhill is +y.
 
     A stop wall stands at the lower edge of the pad. Before the start, the contents of an object settle while the object
-    has a random orientation (limited by the field `tilt`). On the slope, the contents do not move inside the object.
-    The centre of pressure in frame 0 therefore reveals where the contents lie. The weight alone reveals little.
+    has a random orientation. The field `tilt` limits this orientation. On the slope, the contents do not move inside
+    the object. The centre of pressure in frame 0 therefore reveals the place of the contents. The weight alone reveals
+    little about this place.
 
     In most poses, the contents hardly matter: a flat object stays and a high object tips, wherever its contents lie.
     For a start at rest, several random poses are therefore compared (the field `tries` is their number). The object

@@ -1,5 +1,7 @@
 """Mass properties of bodies, given the hidden properties of each draw."""
 
+import concurrent.futures
+import os
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -43,12 +45,17 @@ def rigids(bodies: Sequence[Body], which: Int[np.ndarray, "n"], hidden: Hidden) 
         Arrays with a leading axis of n, in the order of `which`.
     """
     values = jax.tree.map(np.asarray, hidden)
-    found = []
-    for index in np.unique(which).tolist():
-        mine = np.flatnonzero(which == index)
-        for rows in np.split(mine, range(AT_ONCE, len(mine), AT_ONCE)):
-            # Every call has the same number of draws, because another number would round differently and compile anew.
-            own = Hidden(*(x[np.resize(rows, AT_ONCE)] for x in values))
-            rigid = rigid_of_draws(bodies[index], own.fill, own.shell_scale, own.up)
-            found.append([np.asarray(x)[: len(rows)] for x in (*rigid, own.friction)])
+    groups = [np.flatnonzero(which == index) for index in np.unique(which)]
+    calls = [rows for mine in groups for rows in np.split(mine, range(AT_ONCE, len(mine), AT_ONCE))]
+
+    def computed(rows: np.ndarray) -> list[np.ndarray]:
+        # Every call has the same number of draws, because another number would round differently and compile anew.
+        own = Hidden(*(x[np.resize(rows, AT_ONCE)] for x in values))
+        rigid = rigid_of_draws(bodies[which[rows[0]]], own.fill, own.shell_scale, own.up)
+        return [np.asarray(x)[: len(rows)] for x in (*rigid, own.friction)]
+
+    # A call uses one core of a CPU. The first call compiles.
+    found = [computed(rows) for rows in calls[:1]]
+    with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+        found += pool.map(computed, calls[1:])
     return Rigid(*(np.concatenate(parts).astype(np.float64) for parts in zip(*found, strict=True)))

@@ -2,9 +2,9 @@
 
 The results have the same meaning as those of MJX (`physics.roll`). A world is MuJoCo's state of one trajectory.
 
-Every vertex of the hull is a contact point, as in `physics.contact`. MuJoCo alone keeps only four contacts of a mesh
-that stands on a face, which would turn a round base into a square. The mesh collides as well, because the rims of pad
-and wall touch the hull between its vertices.
+Every vertex of the hull is a contact point, as in `physics.contact`. Without these points, MuJoCo would keep only four
+contacts of a mesh that stands on a face, and a round base would act like a square base. The mesh itself also collides,
+because the rims of the pad and the wall touch the hull between its vertices.
 """
 
 from collections.abc import Sequence
@@ -75,7 +75,7 @@ class _Steps(NamedTuple):
 
     @property
     def moving(self) -> Bool[np.ndarray, "n t"]:
-        """True for every step up to the one after which the object has left the pad."""
+        """True for all steps from 0 to `gone`, the step after which the object has left the pad."""
         return np.arange(self.qpos.shape[1]) <= self.gone[:, None]
 
 

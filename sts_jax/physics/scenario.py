@@ -354,8 +354,8 @@ def variant(scenario: _AnyScenario, name: str) -> _AnyScenario:
     Args:
         scenario: Scenario to copy. Its other fields stay the same.
         name: Name of the variant. "default" changes nothing. "off" fixes each hidden property at the middle of its
-            range, and the contents of an object lie at its base. "wide-friction" draws friction from 0.3 to 0.9. With
-            "off-centre", the contents lie at any side of the object, which is the default of the scenario `Inclined`.
+            range, and the contents of an object lie at its base. "wide-friction" draws friction from 0.3 to 0.9.
+            "off-centre" sets `tilt` to pi, so the contents can lie at any side of the object, as in `Inclined()`.
 
     Returns:
         A scenario of the same class.

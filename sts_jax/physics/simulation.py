@@ -67,8 +67,8 @@ def simulate(
         num: Number of trajectories of each body.
         hidden: Hidden properties (friction, mass of the shell, and contents) that replace the random ones, ordered body
             by body. If all bodies together have n trajectories, the field `up` has the shape (n, 3), and the other
-            fields have the shape (n,). The start of a trajectory is the same with and without `hidden`, unless the
-            number of failures of the trajectory (`Trajectory.resampled`) differs.
+            fields have the shape (n,). A trajectory has the same start with and without `hidden` if it has the same
+            number of failures (`Trajectory.resampled`) in both cases.
         progress: True shows a progress bar on standard error. If `progress` is a function, it is called after each
             chunk with the number of trajectories done so far. With MJX, tens of seconds of compilation precede the
             first chunk.

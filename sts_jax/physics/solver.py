@@ -1,4 +1,4 @@
-"""MJX, and a copy of its solver with a line search that never computes NaN."""
+"""Import of MJX (`mjx`), and a copy of MJX's solver with a line search that never computes NaN (`SOLVER`)."""
 
 import contextlib
 import importlib.util

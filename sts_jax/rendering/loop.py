@@ -1,10 +1,10 @@
-"""`looped`: a function that `jax.vmap` turns into a loop on a CPU, including its derivatives.
+"""`looped`: conversion of a function, so that `jax.vmap` runs the function and its derivatives as a loop on a CPU.
 
 Under `jax.vmap`, a function with a data-dependent loop, such as the rasteriser, runs the whole batch for as many
 iterations as its slowest item needs. On a CPU, it is several times as fast to process one item after the other.
 `jax.custom_batching.sequential_vmap` has the same purpose, but no reverse-mode derivative. In this module, the
-derivative is a linear primitive with its own batching rule. It stores the arguments of the function and not the
-intermediate values, and evaluates the function once more in the backward pass.
+derivative is a linear primitive with its own batching rule. The primitive stores the arguments of the function and not
+the intermediate values. The backward pass therefore evaluates the function once more.
 """
 
 import functools

@@ -3,15 +3,15 @@
 The encoders estimate the states of training objects better than the states of other objects. The transition learns its
 density from training objects, and this density is too narrow for other objects. The error depends on the inputs.
 
-Three numbers for each subset of the inputs correct the density: a power of the probabilities of the outcomes, a power
-of the weights of the mixture, and a factor of the variances. They are temperatures in the sense of Guo et al. (2017),
-"On Calibration of Modern Neural Networks". The first number can make the outcomes less or more certain. After a short
-training, the predicted probabilities are often too uncertain. The other two numbers can only widen the density of the
-pose. On few objects, the likelihood is often largest for a narrower density, which then covers too few of the true
-poses of other objects.
+Three numbers for each subset of the inputs correct the density: an exponent of the probabilities of the outcomes, an
+exponent of the weights of the mixture, and a factor of the variances. They are temperatures in the sense of Guo et al.
+(2017), "On Calibration of Modern Neural Networks". The first number can make the outcomes less or more certain, because
+the predicted probabilities are often too uncertain after a short training. The other two numbers can only widen the
+density of the pose. In a fit to few objects, a narrower density often has the largest likelihood, but it covers too few
+of the true poses of other objects.
 
-A fourth number is the contrast of the samples. It makes their outlines sharper, until their gradient energy is that of
-the true images.
+A fourth number is the contrast of the samples. A larger contrast makes the outlines in the samples sharper. The fit
+chooses the contrast at which the gradient energy of the samples is nearest to that of the true images.
 
 `statespace.fitting` finds the numbers on trajectories that the training did not see.
 """
@@ -47,8 +47,8 @@ def of_items(config: Config, calibration: Calibration, present: dict[str, Bool[A
     Args:
         config: Configuration of the model.
         calibration: Numbers for each subset of the inputs.
-        present: Masks `(n,)` of the inputs by name. The density of an item with the true state `state` is not
-            corrected.
+        present: Masks `(n,)` of the inputs by name. True means that the item has the input. The density is not
+            corrected for items that have the true state code `state` as an input.
 
     Returns:
         Numbers for each item, four arrays `(n,)`.

@@ -68,8 +68,8 @@ def fit(
             `training.Preprocessing.encode_condition`. None if the model has no condition.
 
     Returns:
-        The calibration. If no item has all inputs of a subset, its first three values are 1, and its contrast is
-        `CONTRAST`.
+        The calibration. If no item has all inputs of a subset, the first three values of this subset are 1, and the
+        contrast of this subset is `CONTRAST`.
     """
     names = nnx.merge(graphdef, params).config.inputs
     number = len(targets["pose"])

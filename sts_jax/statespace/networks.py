@@ -124,8 +124,8 @@ class Config:
         """The fields by name, in values that `json.dumps` accepts.
 
         The field `vectors` is left out if it has its default value 1. Older versions saved configurations without this
-        field. If the field were not left out, the result would differ from such a configuration, and a training of an
-        older version could not be resumed.
+        field. The result is therefore equal to the saved configuration of an older version, and the training of the
+        older version can be resumed.
         """
         values = dataclasses.asdict(self)
         return {name: value for name, value in values.items() if (name, value) != ("vectors", 1)}
@@ -196,8 +196,8 @@ def parts(config: Config, look: Float[Array, "n look"]) -> tuple[Array, Array, A
     the object rotates.
 
     Args:
-        config: Configuration of the model. Its fields are the number of traits (`traits`), the number of functions in
-            the mesh frame (`own`), and the number of functions in the sensor frame (`shown`).
+        config: Configuration of the model. It defines the number of traits (`traits`), the number of functions in the
+            mesh frame (`own`), and the number of functions in the sensor frame (`shown`).
         look: Appearance codes of n items.
 
     Returns:
@@ -455,12 +455,13 @@ def compose(
         layers: Rendered images of n objects, from the decoder.
         empty: `visual` and `tactile` image of the empty sensor in [0, 1], with the size of the rendered images.
         level: Threshold for each object, from 0 to 1. A threshold gives an object sharp outlines in the visual image.
-            `layers.covered` defines the probability p that the object covers a pixel. The pixel shows the object if p
-            is above the threshold. Otherwise, the pixel shows the empty sensor. If the threshold is drawn uniformly,
-            the pixel shows the object with the probability p. With None, the colour of the pixel is the mean of the
+            `layers.covered` is the logit of the probability p that the object covers a pixel. If p is well above the
+            threshold, the pixel shows the object. If p is well below the threshold, the pixel shows the empty sensor.
+            If p is near the threshold, the pixel shows a mixture of both. If the threshold is drawn uniformly, the
+            pixel shows the object with the probability p. With None, every pixel shows a mixture: the mean of the
             colours of the object and the empty sensor, with the weights p and 1 - p.
-        contrast: Factor of the logits of p with a threshold. Pixels are blended where p is near the threshold. With a
-            larger contrast, the outlines are sharper.
+        contrast: Sharpness of the outlines if there is a threshold. The weight of the object in a mixture is the
+            sigmoid of `contrast * (logit(p) - logit(level))`.
 
     Returns:
         The images `visual` and `tactile` of each object, in [0, 1].

@@ -6,20 +6,21 @@ sum of these terms. NLL is a negative log likelihood.
 
 - `state` and `doubt`: the squared error of the state code that each encoder estimates, and the NLL by which the encoder
   learns the variance of this error
-- `outcome` and `pose`: the NLL of the true outcome, and of the true final pose with the rotation to it, under the
-  transition's density. The belief of every non-empty subset of the inputs counts
+- `outcome` and `pose`: the NLL of the true outcome, and the NLL of the true final pose and of the rotation to it, under
+  the transition's density. Each NLL is a mean over the beliefs from all non-empty subsets of the inputs
 - `visual` and `tactile`: the cross-entropy of the rendered images of the last frame, minus the entropy of the targets.
-  In the visual image, the colours of the pixels that show the object count. In the tactile image, all pixels count
-- `first`: the sum of both errors for the images of the first frame
+  `visual` is a sum over the pixels that show the object. `tactile` is a sum over all pixels
+- `first`: the same errors for the input images of the first frame, summed over the visual and the tactile image
 - `covered`: the cross-entropy of the probability that a pixel shows the object, for both frames
 - `look`: the divergence of the appearance code from its prior, multiplied by `beta` in the loss
 
 Both frames are rendered in their true poses, so that the decoder never averages over several places of an object. The
 appearance code of a sample is drawn from the belief of a random subset of its inputs that contains an image.
 
-Two further kinds of data train some of the terms. *Views* are first frames without a trajectory. They count for `state`
-and `doubt`, and take the place of the first frames of the trajectories in `first` and `covered`. *Falls* are
-trajectories without images. They count for `outcome` and `pose`, with beliefs around the true state.
+Two further kinds of data contribute to some of the terms. *Views* are first frames without a trajectory. Views
+contribute to `state` and `doubt`. In `first` and `covered`, views replace the first frames of the trajectories. *Falls*
+are trajectories without images. Falls contribute to `outcome` and `pose`. The belief of a fall is made from the true
+state. In every second fall, noise is added to the shape and the mass.
 """
 
 import itertools

@@ -149,8 +149,8 @@ def shadows(
 
     d is the depth of the skin, u the unit vector along the gel's face from x towards the light, and t the distance
     along u. An elevation is the angle between a direction from x and the gel's plane (rad), positive into the gel. The
-    arctangent is the largest elevation of other skin. e is the elevation of the light's lower edge, and e + penumbra is
-    the elevation of its upper edge.
+    arctangent is the largest elevation of the skin at the points x + t u. e is the elevation of the light's lower edge,
+    and e + penumbra is the elevation of the light's upper edge.
 
     A light in the gel's plane, as in the paper, has e = 0. Such a light does not illuminate flat skin or the
     tops of pressed parts, because the normals there are perpendicular to the direction of the light. The shadows of

@@ -58,9 +58,9 @@ class Arrays:
 
         Args:
             index: Indices of the samples.
-            further: The keyword argument `views` has row indices for all arrays in the field `views`, and `falls` has
-                row indices for those in the field `falls`. A row is an entry along the first axis. Without the
-                argument, the batch lacks the field.
+            further: The keyword argument `views` has row indices for all arrays in the field `views`, and the keyword
+                argument `falls` has row indices for all arrays in the field `falls`. A row is an entry along the first
+                axis. If an argument is missing, the batch lacks the field of the same name.
 
         Returns:
             A dictionary from the name of each field to its selected arrays. The field `empty` is included as a whole.

@@ -16,9 +16,9 @@ def calibrate(workdir: str | os.PathLike[str], arrays: Arrays) -> Model:
     """Fit the calibration of a trained state-space model, and write it to `calibration.json` in the model's folder.
 
     For new objects, the predicted density of the final pose is too narrow, and the predicted outcomes can be too
-    certain or too uncertain. The calibration corrects both. It also
-    chooses the contrast of samples, see `statespace.fit_calibration`. If the model was
-    calibrated on the same arrays before, nothing is fitted or written.
+    certain or too uncertain. The calibration corrects the density and the probabilities of the outcomes. The fit also
+    chooses the contrast of samples, see `statespace.fit_calibration`. If the model was calibrated on the same arrays
+    before, nothing is fitted or written.
 
     Args:
         workdir: Folder of the model.

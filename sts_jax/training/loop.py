@@ -5,7 +5,7 @@ It is a Python loop over one compiled step, because convolutions in `lax.scan` a
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
@@ -45,7 +45,8 @@ def initial(
     """
     graphdef, params, stats = learner.init(jax.random.key(config.seed))
     optimiser = optimiser or optimisers.optimiser(config, total)
-    return graphdef, TrainState(params, stats, optimiser.init(params), jnp.zeros((), jnp.int32))
+    # Without `jit`, JAX would compile a program for each shape of a parameter.
+    return graphdef, TrainState(params, stats, jax.jit(optimiser.init)(params), jnp.zeros((), jnp.int32))
 
 
 def step(
@@ -205,15 +206,12 @@ def _run(
     records.write(path, kept)  # without the records after the checkpoint, which the steps below write again
     _send(kept, log)
     record = kept[-1] if kept else {}
-    further = {
-        name: order(config.seed + 1, len(own["state"]), size, start, total)
-        for name, own, size in (("views", arrays.views, config.views), ("falls", arrays.falls, config.falls))
-        if own and size
-    }
     recent: list[Terms] = []
-    for done, index in enumerate(order(config.seed, len(arrays), config.batch_size, start, total), start + 1):
-        rows = {name: next(batches) for name, batches in further.items()}
-        state, terms = take(state, arrays.take(index, **rows))
+    batches = _batches(config, arrays, start, total)
+    batch = next(batches, None)
+    for done in range(start + 1, total + 1):
+        state, terms = take(state, batch)
+        batch = next(batches, None)  # while the device computes the step
         recent.append(jax.block_until_ready(terms))
         if done % config.log_every == 0 or done == total:
             record = records.mean(done, recent)
@@ -231,6 +229,17 @@ def _run(
         if progress is not None:
             progress(done, total, record)
     return state
+
+
+def _batches(config: TrainConfig, arrays: Arrays, start: int, total: int) -> Iterator[Batch]:
+    """Iterate over the batches of the steps after step `start`."""
+    further = {
+        name: order(config.seed + 1, len(own["state"]), size, start, total)
+        for name, own, size in (("views", arrays.views, config.views), ("falls", arrays.falls, config.falls))
+        if own and size
+    }
+    for index in order(config.seed, len(arrays), config.batch_size, start, total):
+        yield arrays.take(index, **{name: next(rows) for name, rows in further.items()})
 
 
 def _send(some: list[records.Record], log: Log | None) -> None:

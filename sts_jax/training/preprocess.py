@@ -104,7 +104,7 @@ class Preprocessing:
             condition: Known quantities of the scenario such as an acceleration, c numbers for each item (SI units).
 
         Returns:
-            The numbers divided by `condition_scale`, their typical sizes.
+            The numbers, each divided by its typical size in the field `condition_scale`.
         """
         return condition / jnp.array(self.condition_scale, jnp.float32)
 
@@ -117,10 +117,10 @@ class Preprocessing:
 
         Returns:
             True for images in which at least `touch_blocks` blocks differ from the blank image. A block is a square
-            with a side of `touch_block` pixels. Its change is the difference of its mean colour from that of the blank
-            image. If `touch_level` is True, the median change of all blocks of the image is subtracted, separately for
-            each channel. The block differs if its change exceeds `touch_threshold` in any channel. If
-            `mask_blank_touch` is False, the result is True for all images.
+            with a side of `touch_block` pixels. The change of a block is its mean colour minus the mean colour of the
+            same block in the blank image. If `touch_level` is True, the median change of all blocks of the image is
+            subtracted from each change, separately for each channel. A block differs if the magnitude of its change
+            exceeds `touch_threshold` in any channel. If `mask_blank_touch` is False, the result is True for all images.
         """
         if not self.mask_blank_touch:
             return jnp.ones(tactile.shape[:-3], bool)
@@ -142,8 +142,9 @@ def touch_of_noisy_images(
 
     The estimate of the standard deviation uses the differences between the block means of the images and of the blank
     image. The median is subtracted from the differences of each channel of an image, so a uniform change of the light
-    does not count. The estimate is 1.4826 times the median absolute value of the results. Contacts on less than half of
-    the pad hardly change the estimate. An uneven change of the light since the blank image increases the estimate.
+    has no effect. The estimate is 1.4826 times the median magnitude of the differences after this subtraction. Contacts
+    on less than half of the pad hardly change the estimate. An uneven change of the light since the blank image
+    increases the estimate.
 
     Args:
         preprocessing: Preprocessing whose fields are kept, except the four fields of the contact test.

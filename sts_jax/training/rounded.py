@@ -1,8 +1,9 @@
 """Rounded weights in one small file, for models that are shared.
 
 A weight w of a kernel is stored as an integer q, with `w = q s`. Each output channel has its own step s: the root mean
-square of its weights, divided by 128. A weight changes by at most half a step. A compressed weight takes about 1.2
-bytes, compared with 1.9 bytes in half precision. Vectors, such as biases, are stored unchanged.
+square of the channel's weights, divided by 128. The step is larger if q would not fit into 16 bits. A weight changes by
+at most half a step. A compressed weight takes about 1.2 bytes, compared with 1.9 bytes in half precision. Vectors, such
+as biases, are stored unchanged.
 """
 
 import io

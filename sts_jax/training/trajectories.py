@@ -1,14 +1,15 @@
 """Training arrays and model configurations from the first and the last frames of trajectories."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Array, Bool, Float, UInt8
 
 from sts_jax import mvae, optics, physics, statespace
-from sts_jax.dataset import Ends, Pairs, Views, reduced
+from sts_jax.dataset import Ends, Pairs, Views, reduced_images
 from sts_jax.sensor import Sensor
 from sts_jax.training.arrays import Arrays
 from sts_jax.training.preprocess import Preprocessing
@@ -34,7 +35,7 @@ def frame_arrays(
         missing from the inputs of every sample. If `tactile` is a modality and no first frame shows a contact, `absent`
         is `("tactile",)`, and the arrays have no input `tactile`. Otherwise `absent` is empty.
     """
-    code = np.asarray(preprocessing.encode_pose(jnp.asarray(pairs.pose)))
+    code = np.asarray(_pose_codes(preprocessing, pairs.pose))
     found = {"visual": pairs.visual, "tactile": pairs.tactile, "pose": code}
     condition = np.asarray(preprocessing.encode_condition(jnp.asarray(pairs.condition)))
     return _arrays(found, modalities, preprocessing, blank, condition if condition.shape[1] else None)
@@ -151,8 +152,8 @@ def state_arrays(
     ends: list[Pairs | Ends] = [pairs] if falls is None else [pairs, falls]
     outcome, *other_outcomes = (_outcome_index(own.outcome, scenario) for own in ends)
     condition, *other_conditions = (np.asarray(preprocessing.encode_condition(jnp.asarray(x.condition))) for x in ends)
-    code = np.asarray(preprocessing.encode_pose(jnp.asarray(pairs.pose)))
-    last = reduced(pairs._replace(visual=pairs.visual[:, 1:], tactile=pairs.tactile[:, 1:]), model.image_size)
+    code = np.asarray(_pose_codes(preprocessing, pairs.pose))
+    last = reduced_images({"visual": pairs.visual[:, 1], "tactile": pairs.tactile[:, 1]}, model.image_size)
     inputs = {"visual": pairs.visual[:, 0], "tactile": pairs.tactile[:, 0], "pose": code[:, 0]}
     touched = {"tactile": _touched(pairs.tactile, preprocessing, empty["tactile"])} if "tactile" in model.inputs else {}
     further: dict[str, dict[str, np.ndarray]] = {"views": {}, "falls": {}}
@@ -164,7 +165,7 @@ def state_arrays(
     if falls is not None and len(falls.pose):
         further["falls"] = {
             "state": state_codes(preprocessing, falls.pose[:, 0], falls.support, falls.mass, falls.com),
-            "pose": np.asarray(preprocessing.encode_pose(jnp.asarray(falls.pose[:, 1]))),
+            "pose": np.asarray(_pose_codes(preprocessing, falls.pose[:, 1])),
             "outcome": other_outcomes[0],
         }
         if condition.shape[1]:
@@ -172,8 +173,7 @@ def state_arrays(
     return Arrays(
         inputs={name: np.ascontiguousarray(inputs[name]) for name in model.inputs},
         targets={
-            "visual": last.visual[:, 0],
-            "tactile": last.tactile[:, 0],
+            **last,
             "state": state_codes(preprocessing, pairs.pose[:, 0], pairs.support, pairs.mass, pairs.com),
             "pose": code[:, 1],
             "outcome": outcome,
@@ -213,11 +213,19 @@ def state_codes(
     """
     encode = jax.jit(statespace.encode)
     parts = []
-    for start in range(0, len(pose), SOME):  # bounds the memory
-        rows = slice(start, start + SOME)
-        code = preprocessing.encode_pose(jnp.asarray(pose[rows]))
+    size = min(SOME, len(pose))
+    for start in range(0, len(pose), max(size, 1)):  # bounds the memory
+        # The last part is filled up with copies of the last object, because another size would compile anew.
+        rows = np.minimum(np.arange(start, start + size), len(pose) - 1)
+        code = _pose_codes(preprocessing, pose[rows])
         parts.append(np.asarray(encode(code, support[rows], mass[rows], com[rows])))
-    return np.concatenate(parts)
+    return np.concatenate(parts)[: len(pose)]
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _pose_codes(preprocessing: Preprocessing, pose: Float[Array | np.ndarray, "*n 7"]) -> Float[Array, "*n code"]:
+    """`Preprocessing.encode_pose`, compiled as one program."""
+    return preprocessing.encode_pose(jnp.asarray(pose))
 
 
 def state_model(
@@ -273,9 +281,14 @@ def _touched(tactile: np.ndarray, preprocessing: Preprocessing, blank: np.ndarra
     """Return whether the first tactile image of each trajectory shows a contact."""
     # The images are processed in parts to bound the memory.
     parts = np.array_split(tactile[:, 0], max(len(tactile) // 256, 1))
-    return np.concatenate(
-        [
-            np.asarray(preprocessing.touched(jnp.asarray(part / 255, jnp.float32), jnp.asarray(blank / 255)))
-            for part in parts
-        ]
-    )
+    return np.concatenate([np.asarray(_contacts(preprocessing, part, blank)) for part in parts])
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _contacts(
+    preprocessing: Preprocessing,
+    tactile: UInt8[Array | np.ndarray, "n h w 3"],
+    blank: UInt8[Array | np.ndarray, "h w 3"],
+) -> Bool[Array, "n"]:
+    """`Preprocessing.touched` for uint8 images, compiled as one program."""
+    return preprocessing.touched(tactile.astype(jnp.float32) / 255, blank.astype(jnp.float32) / 255)

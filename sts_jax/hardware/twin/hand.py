@@ -15,8 +15,8 @@ class Hand(AutomaticPerson):
 
     `hardware.collect` shows its instructions as a `View`. The hand sends the matching commands to the twin, and
     confirms every trajectory. If an object does not move after its release, the hand confirms the release, as a person
-    would. If `hardware.collect` detects no contact while a pose is held, the hand continues with the pose of the next
-    trajectory, and the session skips the number of the current trajectory.
+    would. If `hardware.collect` detects no contact of a held object within 3 s, the hand holds the object in the first
+    pose of the next trajectory. The session then skips the number of the current trajectory.
 
     The session and the scene each give every trajectory a number. The two numbers of a trajectory are equal if the
     scene starts to count at the number of the session's next trajectory
@@ -29,7 +29,7 @@ class Hand(AutomaticPerson):
         Args:
             twin: Twin whose object the hand moves.
             session: Session that receives the trajectories.
-            patience_s: Longest time in the same stage of the guide, > 0 (s on the twin's clock).
+            patience_s: Longest time without a new instruction, > 0 (s on the twin's clock).
 
         Raises:
             ValueError: `patience_s` is not positive.

@@ -1,4 +1,4 @@
-"""One camera frame from the images of a scene without and with light: blending, vignetting, noise and JPEG."""
+"""Computes a camera frame from two images of a scene, without and with light: blending, vignetting, noise and JPEG."""
 
 import dataclasses
 import math
@@ -96,8 +96,8 @@ class Blender:
         Args:
             imperfections: Deviations of the camera. `Blender` uses `leakage`, `vignetting`, `read_noise` and
                 `full_well`.
-            exposure: Exposure of the visual stream divided by that of the tactile stream (`Sensor().room.exposure`),
-                > 0.
+            exposure: Exposure of the visual stream divided by the exposure of the tactile stream, > 0. The field
+                `room.exposure` of a `Sensor` contains this ratio.
             warp: Lens distortion. Default: none.
             seed: Seed of the noise.
 

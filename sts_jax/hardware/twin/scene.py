@@ -160,7 +160,7 @@ class _Motion(NamedTuple):
     def drawn(self, elapsed_s: float, motion_rate: float) -> int:
         """The index of the pose that is rendered at a time after the release.
 
-        A moving object changes its rendered pose `motion_rate` times per second. From rest on, it is the last pose.
+        A moving object changes its rendered pose `motion_rate` times per second. An object at rest is in the last pose.
 
         Args:
             elapsed_s: Time since the release (s).
@@ -170,7 +170,7 @@ class _Motion(NamedTuple):
         return frame if elapsed_s * self.rate < self.rest and frame < self.rest else len(self.pose) - 1
 
     def indices(self, motion_rate: float) -> list[int]:
-        """The indices of all poses that are rendered: the first and the last one, then those of the motion."""
+        """The indices of all rendered poses: the first pose, the last pose, then the poses of the motion."""
         steps = int(self.rest / self.rate * motion_rate) + 1
         moving = [self.drawn(step / motion_rate, motion_rate) for step in range(steps)]
         return list(dict.fromkeys([0, len(self.pose) - 1, *moving]))

@@ -43,8 +43,8 @@ class Served:
             twin: Twin whose virtual clock has not advanced yet.
             link: Path at which a symbolic link to the serial port is made, so that the port has a fixed name. Default:
                 no link.
-            host: Address on which the HTTP server listens. With another address than that of the loopback interface,
-                other machines can connect, and there is no password.
+            host: Address on which the HTTP server listens. If `host` is not the loopback interface, other machines can
+                connect without a password.
             http_port: TCP port of the HTTP server. 0 selects a free one.
 
         Raises:
