@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
@@ -187,8 +188,8 @@ def _arrays(
     which = np.asarray(trajectory.body)
     solid = _solid(bodies, which, trajectory.hidden)
     # The support function needs the mirrored hulls only. `objects.mirror` takes longer, because it mirrors all arrays.
-    flip = np.array([1, -1, 1], np.float32)
-    flipped = [dataclasses.replace(body, hulls=np.asarray(body.hulls) * flip) for body in bodies]
+    flip = jnp.array([1.0, -1, 1])
+    flipped = [dataclasses.replace(body, hulls=body.hulls * flip) for body in bodies]
     mirrored = np.stack([objects.support(body) for body in flipped])
     arrays |= {f"solid/{name}": leaf for name, leaf in solid.items()} | {"solid/mirrored": mirrored[which]}
     arrays |= {f"view/{name}": leaf for name, leaf in views.items()}

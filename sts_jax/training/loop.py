@@ -208,10 +208,10 @@ def _run(
     record = kept[-1] if kept else {}
     recent: list[Terms] = []
     batches = _batches(config, arrays, start, total)
-    batch = next(batches, None)
+    batch = next(batches, {})
     for done in range(start + 1, total + 1):
         state, terms = take(state, batch)
-        batch = next(batches, None)  # while the device computes the step
+        batch = next(batches, {})  # while the device computes the step
         recent.append(jax.block_until_ready(terms))
         if done % config.log_every == 0 or done == total:
             record = records.mean(done, recent)

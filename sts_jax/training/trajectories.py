@@ -291,4 +291,4 @@ def _contacts(
     blank: UInt8[Array | np.ndarray, "h w 3"],
 ) -> Bool[Array, "n"]:
     """`Preprocessing.touched` for uint8 images, compiled as one program."""
-    return preprocessing.touched(tactile.astype(jnp.float32) / 255, blank.astype(jnp.float32) / 255)
+    return preprocessing.touched(jnp.asarray(tactile, jnp.float32) / 255, jnp.asarray(blank, jnp.float32) / 255)
