@@ -15,7 +15,7 @@ the light during each exposure. By this log, an image has a wrong or mixed light
 differs from the requested light by more than 0.1 % of the full light.
 
 The camera limits the rate to one pair per two frame periods plus one settling time. A pair needs one switch of the
-light. Switches on and off alternate, so this settling time is the mean of the settling times of the two streams.
+light, on for one pair and off for the next. This settling time is thus the mean of the settling times of both streams.
 """
 
 import dataclasses

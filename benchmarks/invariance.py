@@ -1,4 +1,4 @@
-"""Shares of rest poses and outcomes, compared with half the time step, mirrored scenes, and C MuJoCo.
+"""Shares of rest poses and outcomes, compared with those at half the time step, in mirrored scenes, and in C MuJoCo.
 
     python -m benchmarks.invariance             # 4,000 runs per side, about 50 minutes on two idle cores
     python -m benchmarks.invariance --num 300   # about 5 minutes

@@ -50,7 +50,7 @@ class Args:
 
 
 def plain_conv(x: Array, kernel: Array, stride: int, padding: int) -> Array:
-    """Convolution of XLA with the arguments of `mvae.networks.conv`, as `nnx.Conv` calls it."""
+    """The function `mvae.networks.conv`, implemented with XLA's convolution as in `nnx.Conv`."""
     return jax.lax.conv_general_dilated(x, kernel, (stride, stride), [(padding,) * 2] * 2, dimension_numbers=LAYOUT)
 
 

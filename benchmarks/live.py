@@ -106,7 +106,7 @@ def skill(found: np.ndarray, truth: np.ndarray) -> float:
 
 
 def main(args: Args) -> None:
-    """Record the trajectories, and print the skill of every model with the background kept and divided out."""
+    """Record the trajectories. Print the skill of every model, first with the background kept, then divided out."""
     empty, held, rest = collect(args)
     pinhole, (height, width) = sts.Sensor().camera, empty[0].shape[:2]
     lens = hardware.Lens.ideal(width, height, distance=float(pinhole.distance), field_of_view=math.radians(160))

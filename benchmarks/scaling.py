@@ -90,7 +90,7 @@ def train(
 
 
 def best_possible(workdir: Path) -> float | None:
-    """Read the visual skill of the best possible prediction from `metrics.json`, or return None without that record."""
+    """Read the visual skill of the best possible prediction from `metrics.json`. None: no skill is recorded."""
     path = workdir / "metrics.json"
     if not path.exists():
         return None

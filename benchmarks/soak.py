@@ -134,7 +134,7 @@ def claim(folder: Path, name: str, size: int) -> None:
     """Write the settings of a scenario's blocks to a folder.
 
     Raises:
-        ValueError: The folder has blocks with other settings. The message names the first that differs.
+        ValueError: The folder has blocks with other settings. The message names all settings that differ.
     """
     settings = {"scenario": repr(SCENARIOS[name]), "num": NUM, "block": size, "sunk_limit": SUNK_LIMIT}
     dataset.claim(folder / f"{name}.json", settings)
@@ -152,7 +152,7 @@ def soaked(folder: Path, name: str) -> Starts:
 
     Raises:
         FileNotFoundError: The folder has no blocks.
-        ValueError: The blocks were made with other settings. The message names the first that differs.
+        ValueError: The blocks were made with other settings. The message names all settings that differ.
     """
     claimed, paths = folder / f"{name}.json", sorted(folder.glob(f"{name}-????.npz"))
     if not (claimed.exists() and paths):

@@ -133,7 +133,7 @@ def slope(
 
     The image and the target are blurred before they are compared. For each move, the depth and the tilt of the object
     are computed from the balance of forces in the gel. The derivatives treat the depth and the tilt as constant,
-    because the pad is the same everywhere.
+    because the pad has the same properties at every position.
 
     Args:
         sensor: Constants of the sensor.
@@ -166,8 +166,8 @@ def descend(look: Callable[[np.ndarray, float], Slope], start: np.ndarray) -> li
         start: Initial x (m), y (m) and yaw (rad).
 
     Returns:
-        The accepted points (x, y, yaw) and the result of `look` at each, from `start` on. The last point of one blur
-        occurs again as the first point of the next blur.
+        The accepted points (x, y, yaw), and the result of `look` at each point. The first point is `start`. The last
+        point of one blur occurs again as the first point of the next blur.
     """
     path, at = [], start
     for blur in BLURS:

@@ -22,7 +22,7 @@ def call(function: str, *arguments: Any, cache: Path | None = None) -> Any:
         The result of the function.
 
     Raises:
-        subprocess.CalledProcessError: The new process failed. The error output of this process shows the reason.
+        subprocess.CalledProcessError: The new process failed. The calling process's error output shows the reason.
     """
     module, name = function.rsplit(".", 1)
     environment = os.environ | {"TF_CPP_MIN_LOG_LEVEL": "3"}

@@ -30,7 +30,7 @@ def support(points: np.ndarray, level: float) -> np.ndarray:
 
     Args:
         points: Points of the object (m), `(n, 3)`, with z upwards.
-        level: Points that are less than this height above the lowest point support the object (m).
+        level: Height (m). The object stands on all points that are less than `level` above the lowest point.
 
     Returns:
         Corners of the polygon in counter-clockwise order (m), `(k, 2)`. Two corners if the points lie on a line.

@@ -99,7 +99,7 @@ class Pictures:
         return dataclasses.replace(self, names=names, found=(*there[:place], found, *there[place:]))
 
     def describe(self) -> str:
-        """A text with the number of image parts in which the board was found, and the names of the other parts."""
+        """Text with the number of image parts (`PARTS`) that contained the board, and the names of the other parts."""
         there = hardware.covered(self.found, self.size)
         missing = [part for part in PARTS if part not in there]
         return f"{len(there)} of {len(PARTS)} parts of the image covered" + (

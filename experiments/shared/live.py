@@ -81,7 +81,7 @@ class Views:
     def prepared(self, visual: Image, tactile: Image, empty: Mapping[str, np.ndarray]) -> hardware.SensorView:
         """Convert raw images to the inputs of a model.
 
-        If the images of the empty pad are known and `divided` is True, the brightness and the colours are adapted to
+        If `backgrounds` is not None and its field `divided` is True, the brightness and the colours are adapted to
         those of the model's training images (`hardware.relit`).
 
         Args:

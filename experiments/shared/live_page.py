@@ -58,7 +58,7 @@ class LivePage(Site):
         }
 
     def image(self, stream: str) -> Image | None:
-        """The newest image to show under a name, such as `visual` or `predicted_visual`, or None."""
+        """The newest image of a stream such as `visual` or `predicted_visual`, or None before the first image."""
         with self._changed:
             seen = self._seen
         if seen is None:

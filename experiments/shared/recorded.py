@@ -194,7 +194,7 @@ def jobs(config: Config, data: Recorded) -> Iterator[stages.Job]:
 
 
 def augmented(config: Config, images: np.ndarray, empty: np.ndarray) -> np.ndarray:
-    """Add shifted copies to the training images of a stream, and pairs that have the final image twice.
+    """Add shifted copies of the image pairs of a stream, and copies of the pairs with the final image in both places.
 
     Args:
         config: Configuration of the experiment.

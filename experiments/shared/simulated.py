@@ -1,4 +1,4 @@
-"""Collects trajectories of the digital twin on its virtual clock, with the guide and the session of a real sensor."""
+"""Collects trajectories of the digital twin on its virtual clock, with the same code as for a real sensor."""
 
 import contextlib
 import dataclasses
@@ -71,7 +71,7 @@ class Hand(twin.Hand):
 def collect(config: Simulated) -> None:
     """Collect until there are enough trajectories, or continue an interrupted collection.
 
-    Trajectory n of the session is trajectory n of the scene. A continued collection therefore repeats no trajectory.
+    Trajectory n of the session is trajectory n of `ObjectScene`, so a continued collection repeats no trajectory.
 
     Raises:
         ValueError: The work directory contains data of another sensor or with other options.

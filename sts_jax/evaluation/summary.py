@@ -38,7 +38,7 @@ def summarise(
 
     Returns:
         A dictionary that can be written as JSON, with the following entries. Each metric is a dictionary of `value` and
-        of the limits `low` and `high` of its interval. It is None if the predictor does not have the metric.
+        of the limits `low` and `high` of its interval, or None if the predictor does not have the metric.
 
         - `items`: Number of items.
         - `objects`: Number of different objects among the items.

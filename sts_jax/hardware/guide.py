@@ -4,9 +4,10 @@ The guide is a pure function of a state and a pair of images, and needs no devic
 pad and holds it (stages `PLACE` and `HOLD`), releases it (`RELEASE`), and waits until it rests (`STILL`).
 
 Each image is divided into 24 rows of 32 blocks. A movement is a change of a block's mean colour between two images. The
-noise of single pixels averages out in this mean. A contact is a difference of a mean from the empty pad. A contact can
-be as small as one block. Contacts are therefore detected in blocks of half the width and height. Only changes and
-differences above a threshold count. The threshold is a multiple of the noise of the mean on the empty pad.
+noise of single pixels averages out in the mean colour. A contact is a difference between a mean colour and the mean
+colour of the same block on the empty pad. Contacts are detected in blocks of half the width and height, because a
+contact can be small. Changes and differences count only if they exceed a threshold. The threshold is a multiple of the
+noise that the mean colour has on the empty pad.
 """
 
 import dataclasses

@@ -57,9 +57,10 @@ class ProvenFrames:
             camera: The connected camera.
             leds: The open LED controller.
             levels: Duty cycles of the four channels in the tactile stream, 0 to 255.
-            exposures: Exposures of the visual and of the tactile stream, in the unit of the camera's driver. They are
-                set only if they differ. None: not changed.
-            timeout_s: Longest wait for a frame in `measure_settling` and `see_both`, and before a repeated switch (s).
+            exposures: Exposures of the visual and of the tactile stream, in the unit of the camera's driver. If the
+                two exposures are equal, the camera's exposure is not set. None: not changed.
+            timeout_s: Longest wait for a frame in `measure_settling` and `see_both`, and while `shot` repeats a switch
+                of the lights (s).
             reconnect_s: Longest search for a controller that was lost (s).
         """
         self._camera, self._leds = camera, leds

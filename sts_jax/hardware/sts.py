@@ -54,7 +54,7 @@ class STS:
 
     - It arrived after the settling time. This time begins when the LED controller acknowledges the switch of the
       lights. Earlier frames may show the previous state of the lights.
-    - Two successive frames have shown the effect of the switch. The frame itself can be the second of them.
+    - It is the second of two successive frames that show the effect of the switch, or it arrived after these frames.
     - After the frame arrived, the controller answered the next request. This answer shows that the lights have not
       changed since the acknowledgement.
     - It was not delayed. A delayed frame may have been exposed long before it arrived.
@@ -281,9 +281,9 @@ class STS:
     def read(self, timeout_ms: float | None = None) -> Pair:
         """Take one image of the visual stream and one image of the tactile stream.
 
-        Both frames arrive after the start of the call. The exposure of the first frame may be earlier, by at most one
-        settling time of the lights (`settling`). The first image belongs to the stream for which the lights are already
-        set, so the lights are switched only once for a pair.
+        Both frames arrive after the start of the call. The exposure of the first frame may begin up to one settling
+        time of the lights (`settling`) before this start. The first image belongs to the stream for which the lights
+        are already set, so the lights are switched only once for a pair.
 
         Args:
             timeout_ms: Longest wait for the pair (ms). None: two times the sensor's `timeout_s`. If the LED controller

@@ -14,8 +14,8 @@ The loss is a negative time-lagged evidence lower bound, summed over subsets of 
   channels), or the mean squared error of the components of a vector. `lambda_m` is `Modality.weight`.
 - `beta` weights the divergence.
 
-If a sample has inputs, but none from the modalities of a subset, the loss of this sample omits the subset. The
-posterior of the subset would be the prior, and `z` would be random. Decoders that predict targets from a random `z`
+If a sample has inputs, but none from the modalities of a subset, the loss of this sample omits the subset. The reason
+is that the posterior of the subset is the prior, so `z` is random. Decoders that predict targets from a random `z`
 learn to mix the mean target into every prediction. If a sample has no input at all, its loss keeps all subsets, because
 the mean target is then the right prediction.
 """
@@ -91,7 +91,7 @@ def loss(
     samples, the loss is the same as with the modality in `absent`, but the computation takes longer.
 
     For each modality, one call of the decoder predicts the targets for all subsets. Batch normalisation computes one
-    mean and one variance of each channel for this call. As in the loss, n equal subsets count n times in this
+    mean and one variance of each channel for this call. A prediction for n equal subsets has the weight n in this
     mean and this variance. If two subsets have the same present modalities in a sample, they use the same noise for the
     latent `z`.
 

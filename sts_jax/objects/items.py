@@ -1,4 +1,4 @@
-"""Records of a collection of mesh files: an item before loading, an entry after it, and the library of all items."""
+"""Records of a collection of mesh files: an item before loading, an entry after loading, and the library of items."""
 
 import dataclasses
 from pathlib import Path

@@ -110,7 +110,7 @@ def load(
             image of an OBJ file. If False, these defects are repaired with a warning. The contents of such a mesh then
             fill its convex hull, and missing materials and images are left out.
         up: Axis of the file, or direction in the file, that becomes +z. The convention of glTF files is "y".
-        front: Direction in the file that becomes -y, only if `up` is a tuple. None is (0, -1, 0). If `up` is an axis,
+        front: Direction in the file that becomes -y. If `up` is a tuple, None is (0, -1, 0). If `up` is an axis,
             `front` must be None.
         texture: Image file that replaces the file's own textures. It needs texture coordinates in the mesh.
         textures: Additional folder in which the file's images are looked up.

@@ -121,10 +121,10 @@ def loft(
 
     Args:
         rings: k rings of n points each, (k, n, 3) (mm). A band of the surface connects each ring to the next one.
-        color: One colour (3,) for the whole surface, one for each band, or n for each band, in linear light. There are
-            k - 1 bands, or k if `closed`.
-        ends: Colours of the faces that close the first and the last ring. None in place of a colour leaves this end
-            open. By default, both ends are closed and have the colours of their bands.
+        color: One colour (3,) for the whole surface, one colour for each band, or n colours for each band, in linear
+            light. There are k - 1 bands, or k bands if `closed` is True.
+        ends: Colours of the faces that close the first and the last ring. If one of the two colours is None, that end
+            is open. By default, both ends are closed and have the colours of their bands.
         closed: True if a band also connects the last ring to the first. The surface then has no ends, as in a hoop.
         density: Mass per area (kg/m^2).
         interior: True if the surface bounds the contents of the object, such as the water in a bottle.

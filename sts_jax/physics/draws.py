@@ -1,4 +1,4 @@
-"""Random starts and hidden properties, for the trajectories of `simulate` and, without trajectories, for `starts`."""
+"""Draws of random starts and hidden properties, for the functions `simulate` and `starts`."""
 
 import functools
 from collections.abc import Sequence

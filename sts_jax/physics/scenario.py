@@ -237,7 +237,7 @@ class Scenario(abc.ABC):
         names = {int(outcome): in_words(outcome) for outcome in self.outcomes}
         if number not in names:
             raise ValueError(
-                f"`number` is {number}, but it must be a key of the outcomes of {type(self).__name__}: {names}"
+                f"`number` is {number}, but it must be the number of an outcome of {type(self).__name__}: {names}"
             )
         return names[number]
 

@@ -30,7 +30,7 @@ from sts_jax.statespace.objective import experts, fuse, of_state
 class Calibration(NamedTuple):
     """Numbers that correct the density of the final pose and the sharpness of samples, for each subset of the inputs.
 
-    Each array has one value for each subset. The value 1 of the first three numbers leaves the density unchanged. A
+    Each array has one value for each subset. If `outcome`, `weight` and `variance` are 1, the density is unchanged. A
     subset has the index `sum(2**i for i in members)`, where `members` are the positions of its inputs in
     `Config.inputs`. For example, the subset of the first and the second input has the index 3.
     """

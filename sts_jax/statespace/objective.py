@@ -10,7 +10,7 @@ sum of these terms. NLL is a negative log likelihood.
   the transition's density. Each NLL is a mean over the beliefs from all non-empty subsets of the inputs
 - `visual` and `tactile`: the cross-entropy of the rendered images of the last frame, minus the entropy of the targets.
   `visual` is a sum over the pixels that show the object. `tactile` is a sum over all pixels
-- `first`: the same errors for the input images of the first frame, summed over the visual and the tactile image
+- `first`: the sum of the terms `visual` and `tactile`, but computed for the input images of the first frame
 - `covered`: the cross-entropy of the probability that a pixel shows the object, for both frames
 - `look`: the divergence of the appearance code from its prior, multiplied by `beta` in the loss
 

@@ -11,7 +11,7 @@ If the process is killed while it writes a checkpoint, the previous checkpoint s
 
 A checkpoint has two parts, `weights` and `optimiser`. A prediction reads only the weights, so that a model stays
 readable with another optimiser or another version of optax. Orbax writes both parts. The weights may instead be one
-small file (`sts_jax.training.rounded`). Checkpoints of sts_jax 0.1 have a single part with both, and can still be read.
+small file (`sts_jax.training.rounded`). Checkpoints of sts_jax 0.1 are not divided into parts, and can still be read.
 """
 
 import contextlib
