@@ -1,1 +1,4 @@
-"""Commands that measure speed, endurance, accuracy and the information in touch. `--help` describes each of them."""
+"""Commands that measure speed, endurance, accuracy, and the information in tactile data.
+
+`--help` describes each command.
+"""

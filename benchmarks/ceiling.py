@@ -4,15 +4,17 @@
     python -m benchmarks.ceiling --scenario perturbed
     python -m benchmarks.ceiling --workdir runs/inclined --scenario inclined  # with the dataset of this run
 
-A re-roll is a second simulation of a start, with new random values of the hidden properties, such as friction and mass.
-The command uses the metrics and the held-out starts of the experiment. It prints the errors of three predictions:
+A start is the initial state of a trajectory. A re-roll is another simulation from the same start, with new random
+values of the hidden properties, such as friction and mass. The command uses the metrics and the held-out starts of the
+scenario's experiment. The command prints the errors of three predictions:
 
-- the mean of the re-rolls, which is the best prediction from shape, pose and condition
+- the mean of the re-rolls, which is the best prediction from shape, pose and condition (such as the jerk of the pad)
 - a single re-roll, which is as sharp as a true image
 - the baselines
 
-Below the tables it prints how far the final poses of one start lie apart. Without `--workdir`, the dataset is collected
-into a temporary folder. With `--workdir`, missing parts of that run's dataset are collected in the run's folder.
+Below the tables, the command prints how far the final poses of one start lie apart. Without `--workdir`, the dataset is
+collected into a temporary folder. With `--workdir`, missing parts of that run's dataset are collected in the run's
+folder.
 """
 
 import dataclasses

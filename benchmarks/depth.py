@@ -36,7 +36,7 @@ NUM_POSES = (4, 3, 3)
 
 
 class Difference(NamedTuple):
-    """Differences between a depth image and embree's, as numbers of pixels."""
+    """Pixel counts from the comparison of a depth image with embree's depth image, and the largest interior error."""
 
     interior: int
     interior_beyond_10um: int
@@ -103,7 +103,7 @@ def places(body: objects.Body, rng: np.random.Generator, kind: str) -> tuple[jax
 
 
 def cases(body: objects.Body, seed: int, numbers: Sequence[int] = NUM_POSES) -> Iterator[tuple[jax.Array, jax.Array]]:
-    """Draw the poses and wrenches of an object.
+    """Sample random poses of an object, and the wrench of the pad on the object in each pose.
 
     Args:
         body: The object.

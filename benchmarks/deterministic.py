@@ -3,11 +3,11 @@
     python -m benchmarks.deterministic runs/freefall  # a run of --preset default, about 9 minutes on two CPU cores
     python -m benchmarks.deterministic runs/perturbed --scenario perturbed --seconds 480
 
-Trains a convolutional network without latent variables on the dataset of a run. Its inputs are the first images, the
-first pose and the condition. It minimises the cross-entropy of both last images and of the outcome, and the squared
-error of the final pose. Only trajectories with images are used. Set `--seconds` to the training time of the run's
-state-space model. Prints the errors of the network and of the baselines. Missing parts of the run's dataset are
-collected, and no other files are written.
+Trains a convolutional network without latent variables on the dataset of a run. The inputs of the network are the
+first images, the first pose and the condition. The loss contains the cross-entropies of the last visual image, of the
+last tactile image and of the outcome, and the squared error of the final pose. Only trajectories with images are used.
+Set `--seconds` to the training time of the run's state-space model. Prints the errors of the network and of the
+baselines. Missing parts of the run's dataset are collected, and no other files are written.
 """
 
 import dataclasses
@@ -47,7 +47,10 @@ class Args:
 
 
 class Network(nnx.Module):
-    """Predicts the last images (64x64), pose and outcome from the first images (128x128), pose code and condition."""
+    """Predicts the last images (64x64), pose and outcome from the first images (128x128), pose and condition.
+
+    Poses are encoded as pose codes of 12 numbers, see `training.Preprocessing.encode_pose`.
+    """
 
     def __init__(self, images: int, numbers: int, outcomes: int, rngs: nnx.Rngs) -> None:
         widths = [3 * images, 32, 64, 128, 128]
@@ -95,14 +98,14 @@ def features(inputs: dict[str, Array], condition: Array | None, empty: dict[str,
     """Prepare the inputs of the network.
 
     Args:
-        inputs: Pose codes `pose`, `(n, 12)`, and images `visual`, uint8 `(n, 128, 128, 3)`. Images `tactile` are
-            optional and have the same shape.
-        condition: Condition of each item, `(n, c)`. None: the scenario has none.
-        empty: Images of the untouched sensor, by the same names, uint8.
+        inputs: The key `pose` has the encoded poses, `(n, 12)`. The key `visual` has the visual images, uint8
+            `(n, 128, 128, 3)`. The optional key `tactile` has the tactile images, in the same shape.
+        condition: Condition of each item, `(n, c)`. None: the scenario has no condition.
+        empty: Images of the untouched sensor under the keys `visual` and `tactile`, uint8.
 
     Returns:
-        Images minus those of the untouched sensor, stacked in the channels, `(n, 128, 128, 3 or 6)`, and pose codes and
-        conditions, `(n, 12 + c)`.
+        Images minus the images of the untouched sensor, stacked in the channels, `(n, 128, 128, 3 or 6)`, and encoded
+        poses joined with the conditions, `(n, 12 + c)`.
     """
     images = [inputs[name] / 255.0 - empty[name] / 255.0 for name in ("visual", "tactile") if name in inputs]
     numbers = [inputs["pose"]] if condition is None else [inputs["pose"], condition]
@@ -112,8 +115,8 @@ def features(inputs: dict[str, Array], condition: Array | None, empty: dict[str,
 def loss(graphdef: nnx.GraphDef[Network], params: nnx.State, batch: dict[str, Any]) -> Array:
     """Compute the mean loss of a batch.
 
-    The loss is a weighted sum of the cross-entropies of both images and of the outcome, and the squared error of the
-    pose.
+    The loss is a weighted sum of four terms: the cross-entropies of the last visual image, of the last tactile image
+    and of the outcome, and the squared error of the final pose.
     """
     picture, pose, outcome = nnx.merge(graphdef, params)(*features(batch["inputs"], batch["condition"], batch["empty"]))
     targets = batch["targets"]

@@ -9,13 +9,14 @@ No hardware is needed. A separate process emulates the LED controller on a pseud
 network port. The emulated images are of one colour (`instruments/sensor_peer.py`). With `--twin` they are images of the
 digital twin (`instruments/twin_peer.py`), whose object is held or released after every ten pairs.
 
-The lag of a camera is the time from the end of a frame's exposure to the sending of the frame. The pairs are divided
-equally between several lags, and `hardware.STS` measures its settling times at each of them. The emulated camera logs
-the light during each exposure. By this log, an image has a wrong or mixed light if the mean light of its exposure
-differs from the requested light by more than 0.1 % of the full light.
+The lag of a camera is the time from the end of a frame's exposure to the sending of the frame. The emulated camera has
+several lags in turn, and `hardware.STS` reads an equal share of the pairs at each lag. At each lag, `hardware.STS` also
+measures its settling times, from a switch of the light to the first frame that shows only the new light. The emulated
+camera logs the light during each exposure. By this log, an image has a wrong or mixed light if the mean light of its
+exposure differs from the requested light by more than 0.1 % of the full light.
 
-The camera limits the rate to one pair per two frame periods plus one settling time. A pair needs one switch of the
-light, on for one pair and off for the next. This settling time is thus the mean of the settling times of both streams.
+The camera needs at least two frame periods and one settling time per pair, which limits the rate. The light is switched
+once per pair, in turn on and off. The limit is therefore computed with the mean of the settling times for on and off.
 """
 
 import dataclasses
@@ -46,7 +47,7 @@ class Args:
     """Options of the command line.
 
     Raises:
-        ValueError: There is no lag, or there are fewer pairs than lags.
+        ValueError: The tuple `lags_ms` is empty, or has more values than `pairs`.
     """
 
     pairs: int = 1000  # number of pairs of images, of all lags together
@@ -88,10 +89,10 @@ def serve(link: multiprocessing.connection.Connection, path: Path, lag_s: float,
     """Run the emulated devices in a process of their own, until the process that reads pairs has finished.
 
     Args:
-        link: Connection to the reading process. The first message is the address of the camera. The reading process
-            then sends MOVE any number of times and FINISHED once. The answer to FINISHED is the camera's log, which
-            maps the key of each image to the light of its frame.
-        path: Symbolic link to the controller's port, which is created.
+        link: Connection to the reading process. This function first sends the address of the camera. The reading
+            process then sends MOVE any number of times, to hold or release the twin's object, and FINISHED once. The
+            answer to FINISHED is the camera's log, which maps the key of each image to the light of its frame.
+        path: Path at which a symbolic link to the controller's port is created.
         lag_s: Time from the end of an exposure to the sending of the frame (s).
         twin: Use images of the digital twin.
     """
@@ -106,7 +107,7 @@ def serve(link: multiprocessing.connection.Connection, path: Path, lag_s: float,
 
 
 def measure(lag_ms: float, pairs: int, path: Path, *, twin: bool) -> Measured:
-    """Read pairs of images at one lag, and count the images that were exposed with the light of the other stream.
+    """Read pairs of images at one lag, and count the images that were exposed with a wrong or mixed light.
 
     Args:
         lag_ms: Time from the end of an exposure to the sending of the frame (ms).
@@ -164,7 +165,7 @@ def report(found: list[Measured]) -> str:
 
 
 def measure_all(args: Args) -> list[Measured]:
-    """Divide the pairs between the lags, and measure each lag."""
+    """Read an equal share of the pairs at each lag, and return the results for each lag."""
     number = len(args.lags_ms)
     found = []
     with tempfile.TemporaryDirectory() as folder:
@@ -175,7 +176,7 @@ def measure_all(args: Args) -> list[Measured]:
 
 
 def main(args: Args) -> str:
-    """Measure all lags, write the table to `--out` if given, and return it."""
+    """Read the pairs at all lags, write the table of the results to `--out` if given, and return the table."""
     found = measure_all(args)
     load = os.getloadavg()[1] if hasattr(os, "getloadavg") else float("nan")
     text = (

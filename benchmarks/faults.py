@@ -11,9 +11,10 @@ continue while the fault lasts, and until a pair has been read after its end.
 
 The emulated camera logs the light during each exposure. By this log, an image is counted as wrong if it was taken under
 a wrong or mixed light, or if the camera never took it. An image is counted as old if its exposure began more than the
-settling time before the read.
+settling time before the read. The settling time is the time from a switch of the lights to the first frame that shows
+only the new lights.
 
-In the last kind of fault, a second process reads the pairs, and this process is killed while a light is on.
+In the last kind of fault, a second process reads the pairs, and the second process is killed while a light is on.
 """
 
 import contextlib
@@ -127,7 +128,7 @@ class Bench:
 
     @contextlib.contextmanager
     def connected(self) -> Iterator[hardware.STS]:
-        """Connect a sensor, which measures its settling times, and disconnect it at the end."""
+        """Connect a sensor, which measures how long its lights take to settle, and disconnect the sensor at the end."""
         with unittest.mock.patch("serial.tools.list_ports.comports", side_effect=lambda: self.ports):
             leds = hardware.Leds.connect(
                 self.peer.path, timeout_s=HANDSHAKE_S, answer_s=ANSWER_S, watchdog_ms=WATCHDOG_MS
@@ -148,7 +149,7 @@ class Bench:
         )
 
     def plug_in(self, name: str) -> None:
-        """Plug the controller in at the port `name` of the folder."""
+        """Plug the controller in at the emulated port, the symbolic link `name` in the folder."""
         self.peer.plug_in(self.folder / name)
         self.ports[:] = [_usb_port(str(self.folder / name))]
 
@@ -339,7 +340,7 @@ def _read(bench: Bench, sensor: hardware.STS, count: Count) -> bool:
 
 
 def host(path: str, url: str, width: int, height: int) -> None:
-    """Read pairs without end, in the process that is killed.
+    """Read pairs without end. The function `kill` runs this function in a second process, and kills this process.
 
     Args:
         path: Port of the controller.

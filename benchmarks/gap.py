@@ -1,19 +1,20 @@
-"""Check of the distances that `experiments.gap` computes, for sets of images whose differences are known.
+"""Check of the distances between sets of images that `experiments.gap` computes, for known differences.
 
     python -m benchmarks.gap                                                  # about ten minutes
     python -m benchmarks.gap --out benchmarks/results/gap/known.txt           # also write the table
 
 No hardware is needed. The digital twin with its default imperfections (noise, vignetting, leaking light, JPEG, fisheye
-lens) takes the place of the real sensor. The same twin with almost no imperfections is the simulation ("clean"). Both
-run on a virtual clock with equal seeds, and the benchmark stops if their logs show different poses. It records two
-sessions, `WORKDIR/device` with its sensor file `WORKDIR/sensor.json`, and `WORKDIR/clean`. `experiments.gap` compares
-them:
+lens) takes the place of the real sensor. A second twin with almost no imperfections is the simulation ("clean"). Both
+twins run on a virtual clock with equal seeds, and the benchmark stops if their logs show different poses. The benchmark
+records two sessions, `WORKDIR/device` with its sensor file `WORKDIR/sensor.json`, and `WORKDIR/clean`.
+`experiments.gap` compares the two sessions:
 
     python -m experiments.gap --real runs/gap-twin/device --sensor runs/gap-twin --simulated runs/gap-twin/clean
 
-Each row of the table adds one imperfection to the images of the clean session, and has the distances between the
-changed and the clean images. Two further rows compare images that differ by chance only: the two halves of the clean
-session, and two draws of the twin's noise.
+The first two rows of the table compare images that differ by chance only: the two halves of the clean session, and two
+draws of the twin's noise. Each further row compares the images of the clean session with the same images after a known
+change: one added imperfection or, in the last row, all default imperfections. The distances are the mean absolute error
+of the pixels, the energy distance of image features, and the accuracy of a classifier.
 """
 
 import contextlib
@@ -60,7 +61,7 @@ class Args:
 
 
 def make(seed: int, imperfections: twin.Imperfections, lens: hardware.Lens | None) -> twin.Twin:
-    """Make a digital twin on a virtual clock, with an object of the class `camera`.
+    """Make a digital twin on a virtual clock. The object on the pad is a photo camera, `objects.make(key, "camera")`.
 
     Args:
         seed: Seed of the object, its motion and the noise.
@@ -76,13 +77,13 @@ def make(seed: int, imperfections: twin.Imperfections, lens: hardware.Lens | Non
 
 
 def read_pair(device: twin.Twin) -> tuple[hardware.Pair, tuple[float, ...]]:
-    """Take both images of an object at rest.
+    """Take a visual and a tactile image of an object that does not move.
 
     Returns:
         The visual and the tactile image, and the object's pose (7 numbers) from the twin's log.
 
     Raises:
-        AssertionError: The light changed during an exposure, or the object moved between both images.
+        AssertionError: The light changed during an exposure, or the object moved between the two images.
     """
     shots, poses = [], []
     streams: tuple[tuple[Literal["visual", "tactile"], tuple[int, ...], float], ...] = (
@@ -131,7 +132,7 @@ def recording(folder: Path, note: str) -> Iterator[hardware.Session]:
 
 
 def record(device: twin.Twin, folder: Path, count: int, note: str, bar: Bar) -> list[tuple[float, ...]]:
-    """Record trajectories of the twin: one pair of images of the held object, and one at rest.
+    """Record trajectories of the twin: a pair of images of the held object, and a pair of the object at rest.
 
     Args:
         device: The twin.
@@ -170,7 +171,7 @@ def record(device: twin.Twin, folder: Path, count: int, note: str, bar: Bar) -> 
 
 
 def sessions(args: Args) -> hardware.Recordings:
-    """Record both sessions, write the sensor file of `device`, and return the recordings of `clean`.
+    """Record the sessions `device` and `clean`, save the sensor file of `device`, and return the recordings of `clean`.
 
     Raises:
         AssertionError: The logs of both twins show different poses.
@@ -210,7 +211,7 @@ class Difference:
 
 
 def levels(field: str, values: tuple[Any, ...]) -> list[Difference]:
-    """Make a difference for each value of one field of `twin.Imperfections`."""
+    """Create one `Difference` for each value of one field of `twin.Imperfections`."""
     return [Difference(f"{field} {value:g}", dataclasses.replace(CLEAN, **{field: value})) for value in values]
 
 
@@ -230,7 +231,7 @@ def changed(clean: gap.Streams, difference: Difference, resolution: tuple[int, i
     """Change clean images by a known difference.
 
     Args:
-        clean: Clean images at the size of the camera, uint8.
+        clean: Images of the clean session at the resolution of the twin's camera, uint8.
         difference: The difference.
         resolution: Height and width of the result (pixels).
         seed: Seed of the noise.
@@ -288,7 +289,7 @@ def table(clean: gap.Streams, resolution: tuple[int, int]) -> Iterator[str]:
     """Compare clean images with changed ones, and yield the lines of the table.
 
     Args:
-        clean: Images of the clean session at the size of the camera.
+        clean: Images of the clean session at the resolution of the twin's camera.
         resolution: Height and width at which images are compared (pixels).
     """
     visual, tactile = (np.stack([reduced(image, resolution) for image in images]) for images in clean[:2])
@@ -310,7 +311,7 @@ def main(args: Args) -> None:
     """Record both sessions, then print the table.
 
     Raises:
-        ValueError: An option is out of range, or the work directory has recorded trajectories.
+        ValueError: An option is out of range, or the work directory contains trajectories already.
     """
     if args.trajectories < 2 * gap.FOLDS:
         raise ValueError(

@@ -1,23 +1,25 @@
 """Influence of hidden properties on the outcome, and the information about them in touch and in images.
 
     python -m benchmarks.hidden                 # the jerked pad, about half an hour on two CPU cores
-    python -m benchmarks.hidden outcomes truth  # some of the parts outcomes, truth, pictures, fill
-    python -m benchmarks.hidden --keep FOLDER   # keep starts and outcomes in a folder, and resume from it
+    python -m benchmarks.hidden outcomes truth  # two of the four parts, which are listed below
+    python -m benchmarks.hidden --keep FOLDER   # keep the starts and outcomes in a folder, and resume from this folder
     python -m benchmarks.hidden outcomes truth --scenario inclined --soaked FOLDER  # starts from `benchmarks.soak`
 
-Hidden properties are those that a camera cannot see, such as the fill level of a bottle. The parts are:
+Hidden properties are those that a camera cannot see, such as the fill level of a bottle. A start is the initial state
+of a trajectory. The outcome is how the trajectory ends, such as by toppling. The parts are:
 
-- `outcomes`: the share of each outcome. Also the share of the starts whose outcome changes if only the hidden contents
-  are drawn again: the fill level and, on the slope, also the side on which the contents lie.
-- `truth`: the log loss of two classifiers of the outcome. The inputs of the first one are the exact shape, the first
-  pose and the jerk (on the slope, the pose has the noise `slope_features.SEEN`). The second one has a noisy measurement
-  of touch as a further input: the weight on the jerked pad, or the centre of pressure on the slope. The gain is the
-  relative decrease of the loss.
+- `outcomes`: the share of each outcome, and the share of the starts whose outcome changes if the hidden contents are
+  replaced at random and all else stays the same. The random values are the fill level and, on the slope, also the side
+  on which the contents lie.
+- `truth`: the log loss of two classifiers of the outcome. On the jerked pad, the inputs of the first classifier are the
+  exact shape, the first pose and the jerk. On the slope, the inputs are the exact shape and the first pose with the
+  noise `slope_features.SEEN`. The second classifier has a noisy measurement of touch as a further input: the weight on
+  the jerked pad, or the centre of pressure on the slope. The gain is the relative decrease of the loss.
 - `pictures`: as `truth`, but a small network estimates the measurement of touch from the first uint8 tactile image. The
   network is trained on other objects.
-- `fill`: the AUC of a small network that separates objects that are more than half full from emptier ones. Its inputs
-  are visual images of objects in the air, the same images with a tint on the fuller objects, or tactile images. This
-  part exists for the jerked pad only, where the containers stand.
+- `fill`: the AUC of a small network that separates objects that are more than half full from emptier objects. The
+  inputs of the network are visual images of objects in the air, the same images with a tint on the fuller objects, or
+  tactile images. This part exists for the jerked pad only, because the containers stand there.
 
 Cross-validation folds and bootstrap samples (for 95 % intervals) contain all starts of an object or none. The starts
 are simulated with the defaults of the scenario. All results are printed. The features of the classifiers are in
@@ -63,7 +65,7 @@ class Study:
 
 
 class Lesson(NamedTuple):
-    """Training data of networks, and the images to which they are applied."""
+    """Training data of networks, and the images to which the networks are applied."""
 
     items: list[objects.Body]  # training objects
     starts: Starts  # EXAMPLES starts of each training object
@@ -100,7 +102,8 @@ class Args:
     """Options of the command line.
 
     Raises:
-        ValueError: The scenario lacks one of the parts, or `soaked` is combined with an option that it replaces.
+        ValueError: A requested part does not exist for the scenario, or `soaked` is combined with `objects`, `again` or
+            `keep`, which `soaked` replaces.
     """
 
     parts: tyro.conf.Positional[tuple[Part, ...]] = ()  # parts of the printed report (default: all for the scenario)
@@ -126,7 +129,10 @@ class Args:
 
 
 def outcomes(study: Study, starts: Starts) -> None:
-    """Print the shares of outcomes, of unsettled starts, and of starts whose outcome changes with other contents."""
+    """Print the shares of outcomes, of unsettled starts, and of starts whose outcome changes with other contents.
+
+    A start is unsettled if its object is still on the pad and not at rest at the end of the trajectory.
+    """
     share = functools.partial(classifier.interval, classifier.mean, groups=starts.body)
     for outcome in study.scenario.outcomes:
         print(f"{outcome.name.lower():30s} {share(starts.outcome == outcome)}")
@@ -145,7 +151,7 @@ def losses(study: Study, items: list[objects.Body], starts: Starts, touch: np.nd
     Args:
         study: The study.
         items: The objects.
-        starts: Their starts, one row each.
+        starts: Starts of these objects, with one row for each start.
         touch: Measurement of touch, `(n, k)`, nan without contact. None: the classifier has vision only.
 
     Returns:
@@ -216,7 +222,7 @@ def pictures(study: Study, learned: Lesson, starts: Starts, steps: int) -> np.nd
 
 
 def painted(body: objects.Body) -> objects.Body:
-    """Mix the share TINT of white into the colours of a body."""
+    """Mix white into the colours of a body. The share of white in the new colours is TINT."""
     return dataclasses.replace(body, colors=(1 - TINT) * body.colors + TINT)
 
 
@@ -229,8 +235,8 @@ def aloft(key: PRNGKeyArray, items: list[objects.Body], num: int) -> tuple[Start
         num: Number of starts of each object.
 
     Returns:
-        The starts, their visual images, and the same images in which objects that are more than half full are painted,
-        uint8 `(n, 64, 64, 3)` each.
+        The starts, their visual images, and the same images with a tint (`painted`) on all objects that are more than
+        half full. The images are uint8 `(n, 64, 64, 3)` each.
     """
     starts = roll(key, items, physics.Freefall(frames=11), num)  # 11 frames are the minimum of the scenario
     plain, _ = draw(items, starts)

@@ -14,16 +14,18 @@ ways, which are called sides:
 - `simulate` with C MuJoCo, also with half the time step and mirrored
 - "C MuJoCo": C MuJoCo with a plain model. The contacts are those that C MuJoCo finds for the mesh
 - "C, every vertex": C MuJoCo with a contact sphere at every vertex of the hull. The contacts that C MuJoCo finds for
-  the mesh act at the pad's rims only, where no vertex touches
+  the mesh act only where a rim of the pad presses against the hull between the vertices
 - "C, every vertex, driven pad", for jerked bottles only: the same, but the pad is accelerated on slides under constant
   gravity. On all other sides, the pad is fixed and the jerk is a change of gravity
 
 C MuJoCo keeps at most four contacts of a mesh that stands on a face. A round base thus becomes a square that is up to
-30 % narrower, and rocks and walks more. With a contact at every vertex, C MuJoCo has the same contacts as ours.
+30 % narrower, and rocks and walks more. With a contact at every vertex, C MuJoCo has the same contacts as the side
+"ours".
 
 The command prints the share of each label on our side and on each other side, with the 95 % interval of the difference.
-All sides have the same starts and hidden values, so this is the interval for paired shares (Agresti and Min 2005, with
-half a count added to each cell). The command writes no files.
+All sides have the same starts and hidden values, so each run on our side is paired with a run on each other side. The
+interval is the one for the shares of paired runs (Agresti and Min 2005, with half a count added to each cell). The
+command writes no files.
 """
 
 import concurrent.futures
@@ -67,7 +69,7 @@ class Args:
 
 
 class MirroredFreefall(physics.Freefall):
-    """Freefall with mirrored starts, for objects from `objects.mirror`."""
+    """The scenario `Freefall` with mirrored starts, for objects from `objects.mirror`."""
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
         """Mirror the start that `Freefall.start` draws for the unmirrored shape."""
@@ -75,7 +77,7 @@ class MirroredFreefall(physics.Freefall):
 
 
 class MirroredPerturbed(physics.Perturbed):
-    """Perturbed with mirrored starts and jerks, for objects from `objects.mirror`."""
+    """The scenario `Perturbed` with mirrored starts and jerks, for objects from `objects.mirror`."""
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
         """Mirror the start that `Perturbed.start` draws for the unmirrored shape."""
@@ -83,7 +85,7 @@ class MirroredPerturbed(physics.Perturbed):
 
 
 def mirror(start: Start) -> Start:
-    """Mirror a start and its condition, so that y becomes -y."""
+    """Mirror the pose of a start and the condition, such as an acceleration of the pad, so that y becomes -y."""
     return start._replace(pose=turn(start.pose, 4), condition=turn_condition(start.condition, 4))
 
 
@@ -119,7 +121,7 @@ def box() -> objects.Body:
 
 
 def box_face(first: Float[Array, "7"], last: Float[Array, "7"]) -> Array:
-    """Label of the box: its vertical axis at the end (0, 1 or 2), 3 if no axis is vertical, 4 if the box fell off."""
+    """Label of the box: the axis that is vertical at the end (0, 1 or 2), 3 for no axis, 4 if the box fell off."""
     del first
     vertical = jnp.abs(geometry.quat_to_matrix(geometry.normalize(last[3:]))[2])
     face = jnp.where(jnp.max(vertical) > UP, jnp.argmax(vertical), 3)
@@ -199,7 +201,8 @@ def c_model(body: objects.Body, contact: physics.Contact, every_vertex: bool, dr
     Args:
         body: The object.
         contact: Constants of the contact.
-        every_vertex: Add a contact sphere at every vertex of the hull. Otherwise C MuJoCo finds the mesh's contacts.
+        every_vertex: Add a contact sphere at every vertex of the hull. Otherwise, the only contacts are those that C
+            MuJoCo finds for the mesh.
         driven: Put the pad on two slides, along x and y. Otherwise the pad is fixed.
     """
     gel, parts = Sensor().gel.size, np.asarray(body.hulls)
@@ -282,7 +285,7 @@ def difference(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
 
     Args:
         a: True for the runs that have a label on one side, `(n,)`.
-        b: The same for the other side, `(n,)`.
+        b: True for the runs that have the same label on the other side, `(n,)`.
 
     Returns:
         Middle and half width of the interval of `mean(b) - mean(a)`.
@@ -332,7 +335,7 @@ def compare(found: dict[str, np.ndarray], labels: Sequence[str], margin: float =
     Args:
         found: Index of the label of every run, by name of the side, our side first.
         labels: The labels.
-        margin: Limit for both ends of each interval.
+        margin: Limit for the absolute values of both ends of each interval.
 
     Returns:
         True if all intervals lie within the margin.

@@ -1,12 +1,13 @@
-"""Skill of the models that come with the library on images of the digital twin.
+"""Skill of the library's trained models on images of the digital twin.
 
     python -m benchmarks.live
 
 In the digital twin, a hand holds an object in an unstable pose and lets go. Each model predicts the images at rest from
-the images of the held object, as `experiments.live` does. The command prints the skill of the predicted images, from
-mean squared errors over all trajectories. The skill is 0 for the mean image at rest of the other trajectories, and 1
-for the true image. No model was trained with the twin's noise, vignetting and leaking light. Only the model `released`
-was trained on the scenario `Released` and on objects of the class that the twin shows.
+the images of the held object, as `experiments.live` does. The command prints the skill of the predicted images,
+computed from mean squared errors over all trajectories. The skill is 1 if the prediction is the true image, and 0 if
+the prediction is the mean of the images at rest of the other trajectories. No model was trained with the twin's noise,
+vignetting and leaking light. Only the training trajectories of the model `released` have the scenario `Released`. The
+objects in these trajectories have the same class as the twin's object.
 """
 
 import dataclasses
@@ -74,7 +75,7 @@ def seen(
     """Prepare one stream of some pairs for a model.
 
     Args:
-        views: Conversion from images of the camera to the view of the sensor.
+        views: Conversion from raw images of the twin's camera to the view of the simulated pinhole camera.
         predictor: The model.
         pairs: The pairs, `n` of them.
         index: 0 for the visual stream, 1 for the tactile stream.
@@ -106,7 +107,11 @@ def skill(found: np.ndarray, truth: np.ndarray) -> float:
 
 
 def main(args: Args) -> None:
-    """Record the trajectories. Print the skill of every model, first with the background kept, then divided out."""
+    """Record the trajectories, and print the skill of every model for two kinds of images.
+
+    In the first rows, the images keep the background, such as the twin's vignetting. In the other rows, the images are
+    divided by the images of the empty pad (`hardware.relit`).
+    """
     empty, held, rest = collect(args)
     pinhole, (height, width) = sts.Sensor().camera, empty[0].shape[:2]
     lens = hardware.Lens.ideal(width, height, distance=float(pinhole.distance), field_of_view=math.radians(160))

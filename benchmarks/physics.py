@@ -9,17 +9,18 @@
 All commands print their results. Only `--scaling` writes files.
 
 - Without an option, the command measures steps per second of MJX and of C MuJoCo's batch function (`mujoco.rollout`),
-  both on all cores and with the same starts. It first drops an object with one hull of 32 vertices, then one object of
-  each of the eight classes, with hulls of up to 64 vertices.
-- `--engines N` measures falls per second of both engines of `simulate`, for N falls of each of 16 objects. On a GPU,
-  MJX needs a larger `--chunk` than on a CPU.
+  both on all cores and from the same initial poses. The command first drops an object with one hull of 32 vertices,
+  then one object of each of the eight classes, with hulls of up to 64 vertices.
+- `--engines N` measures falls per second of both engines of `simulate` (MJX and C MuJoCo), for N falls of each of 16
+  objects. MJX simulates `--chunk` falls at once, and needs a larger `--chunk` on a GPU than on a CPU.
 - `--pipeline N` drops a bottle N times, renders every frame in both streams as 64x64 uint8 images, and fetches the
-  images from the device. It measures seconds and frames per second of physics, of rendering and of both together. A
-  frame is one world at one time. C MuJoCo simulates on a CPU, and MJX on a GPU.
-- `--scaling` measures steps per second of 1 to 4,096 worlds at once (65,536 on a GPU).
+  images from the device. The command prints seconds and frames per second of the physics, of the rendering, and of
+  physics and rendering together. A frame is the state of one drop at one time. The engine of the physics is C MuJoCo on
+  a machine without a GPU, and MJX on a GPU.
+- `--scaling` measures steps per second of 1 to 4,096 worlds at once (up to 65,536 on a GPU).
 - `--compile` measures the seconds before the first step of each scenario, and counts the compilations for a hundred
-  objects. It uses two new processes. The first one starts with an empty compilation cache, and the second one with the
-  cache that the first one left.
+  objects. For each scenario, the command starts two new processes. The first process starts with an empty compilation
+  cache. The second process starts with the compilation cache that the first process left.
 
 `--engines` and `--pipeline` include all costs except compilation.
 """
@@ -93,7 +94,7 @@ class Args:
 
 
 class Speeds(NamedTuple):
-    """Steps per second for a number of worlds."""
+    """Steps per second of three ways to simulate a given number of worlds."""
 
     worlds: int  # trajectories that are simulated together
     at_once: float  # MJX, one call for all worlds
@@ -121,11 +122,11 @@ def in_c(items: list[objects.Body], traj: physics.Trajectory, constants: physics
 
     Args:
         items: The objects.
-        traj: Trajectories, whose starts and hidden values are used.
+        traj: Trajectories. Their initial poses and hidden properties, such as friction, are used.
         constants: Constants of the contact.
 
     Returns:
-        A `mujoco.MjModel` for each trajectory, and the first states, `(n, size)`.
+        A `mujoco.MjModel` for each trajectory, and the initial states, `(n, size)`.
     """
     gel, models, states = Sensor().gel.size, [], []
     pad = (float(gel[0]), float(gel[1]))
@@ -145,13 +146,13 @@ def in_c(items: list[objects.Body], traj: physics.Trajectory, constants: physics
 
 
 def speed(num: int) -> None:
-    """Print steps per second of both engines, for drops of one hull of 32 vertices and of eight objects."""
+    """Print steps per second of MJX and of C MuJoCo, for drops of one hull of 32 vertices and of eight objects."""
     compare_speed("one hull of 32 vertices", [rod()], 8 * num)
     compare_speed("eight objects, up to 64 vertices", bodies(objects.CATEGORIES, 8), num)
 
 
 def compare_speed(name: str, items: list[objects.Body], num: int) -> None:
-    """Print steps per second of both engines, for `num` drops of each object."""
+    """Print steps per second of MJX and of C MuJoCo, for `num` drops of each object."""
     sensor, scenario = Sensor(), physics.Freefall()
     simulate = functools.partial(physics.simulate, jax.random.key(0), items, sensor, scenario, num, engine="mjx")
     traj, steps = simulate(), scenario.frames * scenario.steps
@@ -201,10 +202,10 @@ def grouped(models: list, states: np.ndarray) -> list[tuple[list, np.ndarray]]:
 
 
 def worlds(count: int, frames: int) -> tuple[Worlds, mjx.Model, mjx.Data]:
-    """Make the arguments that `simulate` passes to MJX for drops of the rod from 2 mm.
+    """Make the arguments that `simulate` passes to MJX for drops of the rod from a height of 2 mm.
 
     Args:
-        count: Number of worlds. There are at most 256 different starts, which further worlds repeat.
+        count: Number of worlds. The first 256 worlds have different starts. Further worlds repeat these starts.
         frames: Frames of each trajectory.
 
     Returns:
@@ -229,7 +230,8 @@ def scaling(frames: int = 8, chunk: int = 32) -> None:
 
     Args:
         frames: Frames of each trajectory.
-        chunk: Number of worlds in each call, if the worlds are divided between threads.
+        chunk: Number of worlds in each MJX call of the measurement with several threads. The other MJX measurement
+            simulates all worlds in one call.
     """
     gpu = jax.default_backend() != "cpu"
     counts = [4**k for k in range(9 if gpu else 7)]
@@ -271,7 +273,7 @@ def write_scaling(rows: Sequence[Speeds], device: str, chunk: int) -> None:
     Args:
         rows: Steps per second for each number of worlds.
         device: Name of the device, for the title.
-        chunk: Number of worlds in each call, if the worlds are divided between threads.
+        chunk: Number of worlds in each MJX call of the measurement with several threads.
     """
     from matplotlib.figure import Figure
 
@@ -310,7 +312,7 @@ def draw(body: objects.Body, traj: physics.Trajectory) -> None:
 
 
 def pipeline(count: int) -> None:
-    """Print frames per second of the physics, of both streams, and of both together, for drops of a bottle."""
+    """Print frames per second of physics, of rendering both streams, and of the pipeline, for drops of a bottle."""
     engine: physics.Engine = "mujoco" if jax.default_backend() == "cpu" else "mjx"
     chunk = 32 if engine == "mujoco" else count
     body, scenario = objects.make(jax.random.key(0), "bottle"), physics.Freefall()
@@ -331,15 +333,16 @@ def pipeline(count: int) -> None:
 
 
 def first_call(name: str, count: int) -> dict[str, Any]:
-    """Measure the first call of `simulate` in this process, which must be a new one.
+    """Measure the first call of `simulate` in this process, which must be a new process.
 
     Args:
         name: Name of the scenario, in SCENARIOS.
-        count: Number of objects whose compilations are counted.
+        count: Number of objects. Compilations are counted for the objects that the scenario accepts.
 
     Returns:
-        `seconds`: time of the first call minus that of the second, in seconds. `objects`: number of the objects that
-        the scenario accepts. `programs`: number of compilations for these objects, by function of `simulate`.
+        A dict. `seconds`: duration of the first call minus duration of the second call (s). `objects`: number of
+        objects that the scenario accepts. `programs`: number of compilations of each compiled function of `simulate`
+        for these objects.
     """
     scenario, sensor, items = SCENARIOS[name], Sensor(), bodies(objects.CATEGORIES, count)
     items = [body for body in items if physics.refusal(body, scenario) is None]

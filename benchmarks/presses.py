@@ -10,13 +10,14 @@ press is held out. An image is modelled by
     image = background (1 + phong(pressed) - phong(flat))
 
 where `pressed` and `flat` are the normals and points of the pressed and of the flat skin. The image of the flat skin is
-thus the background, and the change is proportional to the brightness of the background. Values are those of the camera,
-divided by 255. Non-negative least squares selects lights from candidates in rings around the image. Gradient descent
-then fits the positions and colours of the lights, the fall-off, the specular share and the shininess. The fitted lights
-explain the images, and need not be at the places of the sensor's LEDs. A few of them end up below the image.
+thus the background, and the change is proportional to the brightness of the background. All images contain the pixel
+values of the camera divided by 255. Non-negative least squares selects lights from candidates in rings around the
+image. Gradient descent then fits the positions and colours of the lights, the fall-off, the specular share and the
+shininess. The fitted lights explain the images, and need not be at the places of the sensor's LEDs. A few fitted lights
+lie under the part of the gel that the image shows.
 
 The command prints the peak signal-to-noise ratio of the background alone, of a fit with far lights, and of a fit with
-near lights. The ratio is over all held-out presses, and over the pixels within 0.92 times the radius of the contact.
+near lights. Each ratio is computed over the pixels of all held-out presses within 0.92 times the radius of the contact.
 `presses.png` has a column for each held-out press: the real image, our image, and four times their difference on grey.
 Outside of the contact the shape of the skin is unknown, and our image is the background. Candidates, number of steps
 and learning rate were chosen on the 36 presses alone.
@@ -129,8 +130,8 @@ def pixels(presses: Presses, which: np.ndarray, *, every: int = 1, within: float
 
     Args:
         presses: The images and contacts.
-        which: Numbers of the presses.
-        every: Step between the rows, and between the columns, that are used.
+        which: Indices of the presses.
+        every: Step from one used row to the next, and from one used column to the next.
         within: Share of the contact's radius within which pixels are used.
     """
     shape, found = presses.background.shape[:2], []
@@ -145,13 +146,14 @@ def pixels(presses: Presses, which: np.ndarray, *, every: int = 1, within: float
 
 
 def shader(unknowns: dict[str, Array], *, near: bool) -> tuple[tactile.Phong, tactile.Lights | tactile.Leds]:
-    """Convert the unbounded unknowns of the optimisation to constants of the shader, which are all in range.
+    """Convert the unbounded unknowns of the optimisation to constants and lights with values in the allowed ranges.
 
     Args:
-        unknowns: Place `place` of each light, `(m, 3)`: x and y in mm, and the softplus inverse of the depth below the
-            gel's face in mm. Also the softplus inverses of `color` `(m, 3)`, `falloff`, `specular` and `shininess`.
-        near: Use near lights (LEDs) at the places. Otherwise the places are directions of far lights, and the fall-off
-            is ignored.
+        unknowns: The array `place`, `(m, 3)`, contains x and y of each light in mm, and the softplus inverse of the
+            light's depth below the gel's face in mm. The arrays `color`, `(m, 3)`, `falloff`, `specular` and
+            `shininess` contain the softplus inverses of these quantities.
+        near: True returns near lights (LEDs) at the positions `place`. False returns far lights in the directions
+            `place`, and ignores `falloff`.
 
     Returns:
         The constants of the reflectance, and the lights.
@@ -168,7 +170,7 @@ def shader(unknowns: dict[str, Array], *, near: bool) -> tuple[tactile.Phong, ta
 
 
 def changes(constants: tactile.Phong, lights: tactile.Lights | tactile.Leds, given: Pixels) -> Float[Array, "m p"]:
-    """Image of the pressed skin minus image of the flat skin, for each light alone and in white.
+    """Image of the pressed skin minus image of the flat skin, for each light alone and with the colour white.
 
     The lights are vmapped, because the gradient of the shader's own loop over lights takes minutes to compile.
 
@@ -277,7 +279,7 @@ def panel(presses: Presses, index: int, constants: tactile.Phong, leds: tactile.
 
 
 def main() -> None:
-    """Fit the lights, print the errors and write `presses.png` and `presses.txt`."""
+    """Fit the lights, print the peak signal-to-noise ratios, and write `presses.png` and `presses.txt`."""
     OUT.mkdir(parents=True, exist_ok=True)
     lines: list[str] = []
 

@@ -1,11 +1,12 @@
-"""Draw a picture that tests whether people can match predicted images at rest with the true ones.
+"""Draw a picture that tests whether people can match predicted images at rest with the true images.
 
     python -m benchmarks.recognise runs/freefall --out recognise.png           # about a minute
     python -m benchmarks.recognise runs/freefall --given visual pose --first 20
 
-Predicts ten consecutive held-out trajectories of a run. The upper rows of the picture show one sample of the last
-visual image of each trajectory (A to J). The lower rows show the ten true images in another order (1 to 10). The
-picture is written to `--out`, and the answers are printed. A person who guesses matches one pair on average.
+The command predicts ten consecutive held-out trajectories of a run. The upper rows of the picture show one predicted
+sample of the last visual image of each trajectory (A to J). The lower rows show the ten true last images in another
+order (1 to 10). The command writes the picture to `--out` and prints the answers. With random answers, a person has one
+correct pair on average.
 """
 
 import dataclasses

@@ -1,12 +1,13 @@
-"""Time to write a pair of images of the real sensor to disk, and the size of the files.
+"""Duration of writing a pair of images of the real sensor to disk, and size of the files.
 
     python -m benchmarks.recording                  # a few seconds
     python -m benchmarks.recording --folder /mnt    # on another disk
 
-Writes pairs as `hardware.Session` does. The folder of a pair contains both images as PNG files and the checksums of the
-files, and is flushed to the disk. The images are smooth, without noise or with noise of standard deviation 1.5 (of
-255). Prints, for two image sizes, the size of a pair, the median time of encoding, the median time of writing, and the
-longest time of encoding and writing together. The files are deleted afterwards.
+The command writes pairs of a visual and a tactile image as `hardware.Session` does. The folder of a pair contains both
+images as PNG files and the checksums of the files, and is flushed to the disk. The images are smooth, either without
+noise or with noise of standard deviation 1.5 (of 255). For two image sizes, the command prints the size of a pair, the
+median time of encoding, the median time of writing, and the longest time of encoding and writing together. The command
+deletes the files afterwards.
 """
 
 import dataclasses
@@ -48,7 +49,7 @@ def pair(random: np.random.Generator, width: int, height: int, noise: float) -> 
 
 
 def main(args: Args) -> None:
-    """Write pairs of both sizes, without and with noise, and print a table."""
+    """Write pairs of the two image sizes in SIZES, without and with noise, and print a table."""
     random = np.random.default_rng(args.seed)
     print("size         noise   MB a pair   ms to encode   ms to write   longest of both")
     for width, height in SIZES:

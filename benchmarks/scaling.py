@@ -1,12 +1,13 @@
 """Skill of the state-space model for different numbers of training trajectories and of training steps.
 
     python -m benchmarks.scaling runs/freefall --out scaling.png  # a run of --preset default, about 20 minutes
-    python -m benchmarks.scaling runs/freefall --shares 1 --steps 2000 --seeds 1 2   # the spread between two more seeds
+    python -m benchmarks.scaling runs/freefall --shares 1 --steps 2000 --seeds 1 2   # two more seeds show the spread
 
-Uses the dataset of a run, and trains models in the folder `scaling` of the run. Some models see a share of the training
-objects (`--shares`) and are trained for the largest number of `--steps`. The others see all training objects, and are
-trained for each number of `--steps`. Models that the folder has already are not trained again. Prints the errors on the
-held-out objects, and draws the visual skill with 95 % intervals to `--out`.
+The command uses the dataset of a run, and trains models in the folder `scaling` of the run. Some models are trained on
+a share of the training objects (`--shares`), with the largest number of steps in `--steps`. The other models are
+trained on all training objects, with each number of steps in `--steps`. Models that exist already in the folder are not
+trained again. The command prints the errors of the predictions for the held-out objects, and writes a plot of the
+visual skill with 95 % intervals to `--out`.
 """
 
 import dataclasses
@@ -45,7 +46,7 @@ class Args:
 
 
 class Point(NamedTuple):
-    """A trained model and the inputs with which it is tested."""
+    """The input modalities in the test of a trained model, and the amount of training of this model."""
 
     inputs: str
     trajectories: int  # of the training set
@@ -61,7 +62,7 @@ def some(part: Part, objects: np.ndarray) -> Part:
 def train(
     config: Config, data: dataset.Dataset, folder: Path, share: float, steps: int, seed: int
 ) -> tuple[int, float]:
-    """Train a model, unless its folder has one.
+    """Train a model, unless `folder` already contains a trained model.
 
     Args:
         config: Configuration of the run.

@@ -1,4 +1,4 @@
-"""Frames per second of `sense`, compared with embree's depth alone, and the cost of a frame by its size.
+"""Frames per second of `sense` and of embree, which traces only the depth, and the cost of a frame by its size.
 
     python -m benchmarks.sensor             # about 12 minutes on two CPU cores, most of it compilation
     python -m benchmarks.sensor --taxim     # about a minute: tactile images from height maps, compared with taxim
@@ -7,11 +7,12 @@
 
 All commands print their results. Only `--cost` writes a file, the plot benchmarks/results/sensor/cost.png.
 
-Without an option, the command renders objects at rest on the pad with `sense`: balance of the gel, both streams, depth
-and segmentation. For comparison, embree traces only the depth of the same faces and poses, in three ways:
+Without an option, the command calls `sense` for objects at rest on the pad. `sense` computes the equilibrium of the
+gel, the visual image, the tactile image, the depth and the segmentation. For comparison, embree traces only the depth
+of the same faces and poses, in three ways:
 
 - `traced`: one call of embreex with all rays of an image, and a scene that was built beforehand
-- `built`: the same, but the scene is built for each pose, as a moving object needs it
+- `built`: a call that also builds the scene, because a moving object needs a new scene for each pose
 - `trimesh`: the Python interface `mesh.ray` of trimesh
 
 All calls are timed in one thread, and also in as many threads as there are cores. One call of `sense` uses little more
@@ -154,7 +155,7 @@ def embree(body: objects.Body, poses: jax.Array, shape: tuple[int, int]) -> dict
         shape: Height and width of the images (pixels).
 
     Returns:
-        A list with one function for each pose, for each of the ways `traced`, `built` and `trimesh`.
+        A dictionary with the keys `traced`, `built` and `trimesh`. Each value is a list with a function for each pose.
     """
     camera = sts.Sensor().camera
     faces = np.asarray(body.faces)

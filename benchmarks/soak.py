@@ -1,14 +1,15 @@
 """Endurance test: failures, outcomes and accuracy of many thousand trajectories of each scenario.
 
-    python -m benchmarks.soak                            # 30,000 trajectories, about two hours on two CPU cores
+    python -m benchmarks.soak                            # 10,000 trajectories per scenario, about 2 hours on two cores
     python -m benchmarks.soak --num 300 --only inclined  # about a minute
     python -m benchmarks.soak --keep FOLDER              # keep finished blocks in a folder, and resume from it
-    python -m benchmarks.soak --first-block 17           # only blocks 17 to 19, if another machine runs 0 to 16
+    python -m benchmarks.soak --first-block 17           # skip blocks 0 to 16, if another machine runs these blocks
 
-Every eight trajectories have a new object. Its class changes in turn, except on the jerked pad, where all objects are
-bottles. The command counts outcomes, unsettled trajectories, and trajectories that `simulate` discarded and drew again,
-because they were not finite or because the object sank deeper into the pad than the limit. It compares the wrench at
-rest with the weight, and the energy in frames without contact with the energy at the start. All results are printed.
+A new object is made for every eight trajectories. The classes of the objects take turns, except on the jerked pad,
+where all objects are bottles. The command counts outcomes, unsettled trajectories, and trajectories that `simulate`
+discarded and drew again, because they were not finite or because the object sank deeper into the pad than the limit.
+It compares the wrench at rest with the weight, and the energy in frames without contact with the energy at the start.
+All results are printed.
 
 The trajectories are simulated in blocks of 504, or of fewer if fewer are requested. `benchmarks.hidden --soaked FOLDER`
 analyses the blocks that `--keep FOLDER` has kept.
@@ -148,7 +149,8 @@ def soaked(folder: Path, name: str) -> Starts:
         name: Name of the scenario, in SCENARIOS.
 
     Returns:
-        The starts and outcomes. The field `rerolled` is -1 throughout, because no start was simulated again.
+        The starts and outcomes. The field `rerolled` is for second simulations of the same starts with other contents
+        of the objects. All values of this field are -1, because this benchmark simulates no start twice.
 
     Raises:
         FileNotFoundError: The folder has no blocks.

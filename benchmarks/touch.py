@@ -53,7 +53,7 @@ def ridge(x: np.ndarray, y: np.ndarray, x_new: np.ndarray, penalty: float = 1.0)
     Args:
         x: Training features, `(n, k)`.
         y: Training targets, `(n,)`.
-        x_new: Features of the predictions, `(m, k)`.
+        x_new: Features of the items to predict, `(m, k)`.
         penalty: Weight of the squared coefficients.
 
     Returns:

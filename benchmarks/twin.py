@@ -3,9 +3,9 @@
     python -m benchmarks.twin
 
 Prints, for each size, the time to render a pose, the time to make a noisy frame with the light on for half of the
-exposure, and the time to encode this frame as JPEG. With the light off, it also prints the frames per second on the
-virtual clock, and the frames per second that a second process receives through OpenCV. All values are medians, and all
-processes run on one CPU core.
+exposure, and the time to encode this frame as JPEG. With the light off, it also prints how many frames per second the
+twin makes on its virtual clock, which does not wait for real time, and how many frames per second a second process
+receives through OpenCV. All values are medians, and all processes run on one CPU core.
 """
 
 import dataclasses
@@ -60,7 +60,7 @@ def timed(call: Callable[[], object], number: int) -> float:
 
 
 def held(size: tuple[int, int], exposure_s: float) -> tuple[twin.Twin, twin.ObjectScene]:
-    """Make a twin and its scene, with an object of the class `camera` and a lens of 160 degrees.
+    """Make a twin with a lens of 160 degrees, and the twin's scene: an object of the class "camera" on the pad.
 
     Args:
         size: Height and width of the frames (pixels).
@@ -93,7 +93,7 @@ def served(size: tuple[int, int], number: int) -> float:
 
 
 def main(args: Args) -> None:
-    """Measure both sizes on one CPU core, and print a line for each."""
+    """Measure each image size in SIZES on one CPU core, and print a line for each size."""
     core = min(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {core})
     for size in SIZES:

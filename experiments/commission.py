@@ -4,10 +4,10 @@
     python -m experiments.commission --print-board board.pdf            # the board to print
     python -m experiments.commission --camera /dev/video0 --leds /dev/ttyACM0 --out bench
 
-The command finds the exposure of each stream, measures how long a switch of the lights takes, records images of the
-empty pad, and calibrates the lens from pictures of the board. It writes OUT/sensor.json, which `Sensor.load` and
-`hardware.STS.from_file` read. Pictures of the board are kept in OUT/board, so the same command continues after an
-interruption.
+The command finds the exposure of each stream, measures the time from a change of the lights to the first frame that
+shows only the new lights, records images of the empty pad, and calibrates the lens from pictures of the board. The
+command writes OUT/sensor.json, which `Sensor.load` and `hardware.STS.from_file` read. Pictures of the board are kept in
+OUT/board, so the same command continues after an interruption.
 """
 
 import contextlib
@@ -34,7 +34,7 @@ V4L2_UNIT = 1e-4  # unit of the exposure of a Video4Linux device (s)
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """The devices, the folder, and the source of the lens."""
+    """Options of the command line: devices, output folder, and a calibrated lens or an assumed ideal lens."""
 
     camera: str | None = None  # path of the camera, such as /dev/v4l/by-id/..., or URL. None: list cameras and stop
     leds: str | None = None  # serial port of the LED controller, such as /dev/ttyACM0. None: list ports and stop
@@ -58,7 +58,7 @@ class Config:
 
     @property
     def board(self) -> hardware.Board:
-        """The board in the size in which it was printed, from `ruler`."""
+        """The board with the sizes on the printed page, computed from the measured length `ruler`."""
         scale, nominal = self.ruler / 100, hardware.Board()
         return dataclasses.replace(nominal, square=scale * nominal.square, marker=scale * nominal.marker)
 
@@ -219,7 +219,8 @@ def live(config: Config, sensor: hardware.STS, pinhole: hardware.Pinhole) -> har
 
     Raises:
         CalibrationError: As in `fit`. The message explains how to replace or add pictures.
-        ValueError: A picture of an earlier run has another size or cannot be read, or there is no keyboard.
+        ValueError: A picture of an earlier run has another size or cannot be read, or `every` is None and there is no
+            keyboard on which to press Enter.
     """
     folder, size = config.out / "board", (config.width, config.height)
     pictures = boards.Pictures.read(folder, config.board, size)
@@ -250,15 +251,15 @@ def check_folder(config: Config, camera: hardware.Camera, leds: hardware.Leds) -
         raise ValueError(
             f"{config.out} contains the sensor file of the camera {there.camera} and the LED controller {there.leds}, "
             f"but the connected devices are {camera.source} and {leds.serial_number}: give another --out, or delete "
-            "this file"
+            "this sensor file"
         )
 
 
 def claim_pictures(config: Config, camera: hardware.Camera) -> None:
-    """Reserve the folder of live pictures for one camera, image size and print of the board.
+    """Reserve the folder of live pictures for one camera, one image size and one printed board.
 
     Raises:
-        ValueError: The folder has pictures from another camera, of another size, or of another print of the board.
+        ValueError: The folder has pictures from another camera, of another size, or of a board with another `ruler`.
     """
     made = {"camera": camera.source, "width": config.width, "height": config.height, "ruler": config.ruler}
     _files.claim(config.out / "board" / "camera.json", made)

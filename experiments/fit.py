@@ -7,10 +7,10 @@ The first argument is an object class or a mesh file, as in experiments.sense. T
 the object at rest under its weight. The object, the face on which it rests and its weight are known. The command fits
 x, y and yaw ten times. Each fit starts 3 mm and 10 degrees away from the true pose.
 
-A line is printed for each fit. The next line contains the number of fits that end within 0.2 mm and 1 degree of the
-true pose. This number is ten for scissors, fork and mouse, and eight for scissors with `--seed 1`. The picture shows
-the target, the images at the start and at the end of the first fit, and the path of every fit. To fit your own image,
-pass the image to `slope` as `target`, and pass `descend` a function that calls `slope`.
+The command prints one line for each fit. After the last fit, the command prints the number of fits that ended within
+0.2 mm and 1 degree of the true pose. This number is ten for scissors, fork and mouse, and eight for scissors with
+`--seed 1`. The picture shows the target, the images at the start and at the end of the first fit, and the path of every
+fit. To fit your own image, call `descend` with a function that calls `slope` with your image as `target`.
 """
 
 import dataclasses
@@ -131,9 +131,9 @@ def slope(
 ) -> Slope:
     """Compute the loss of the moved object's image, and the derivatives of the loss with respect to the move.
 
-    The image and the target are blurred before they are compared. For each move, the depth and the tilt of the object
-    are computed from the balance of forces in the gel. The derivatives treat the depth and the tilt as constant,
-    because the pad has the same properties at every position.
+    The image and the target are blurred before they are compared. For each value of `at`, the depth and the tilt of the
+    object are computed from the balance of forces in the gel. The pad has the same properties at every position, so the
+    depth and the tilt do not depend on the move. The derivatives therefore treat the depth and the tilt as constant.
 
     Args:
         sensor: Constants of the sensor.

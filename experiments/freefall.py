@@ -1,4 +1,4 @@
-"""Predict the images and the pose at rest of objects that fall on the pad, from a first frame in the air.
+"""Predict the images and the pose at rest of objects that fall on the pad, from a first frame of the object in the air.
 
     python -m experiments.freefall                    # 10 to 30 minutes on two CPU cores
     python -m experiments.freefall --preset long      # 1.5 to 2.5 hours, can be stopped and started again
@@ -32,7 +32,7 @@ COLLECTION = dataset.Collection(
 )
 DEFAULT = config.Config(
     collection=COLLECTION,
-    state_training=dataclasses.replace(config.STATE_TRAINING, steps=2000),
+    state_training=dataclasses.replace(config.STATE_TRAINING, steps=1900),
     training=TrainConfig(batch_size=16, learning_rate=2e-3, schedule="cosine", encoder_epsilon=3.0),
     steps=(1500, 600, 600, 100),
 )

@@ -1,4 +1,4 @@
-"""Measure how much real and simulated images of the same object differ, and draw both.
+"""Measure how much real and simulated images of the same object differ, and draw the images side by side.
 
     python -m experiments.gap --real runs/real/dataset --sensor bench --match none \\
         --simulated runs/twin/dataset --simulated-sensor runs/twin
@@ -8,9 +8,9 @@
 an experiment that was run with `--collection.no-crop`. Raw images are rectified with the lens of the sensor file.
 
 The command prints differences per pixel, the distance between the distributions of real and simulated images in a
-feature space, and the accuracy of a classifier that tries to distinguish real from simulated images. The same text and
-a figure are written to `--out`. The command takes about a minute for 40 trajectories. The classifier needs
-scikit-learn (`pip install -e '.[bench]'`).
+feature space, and the accuracy of a classifier that tries to distinguish real from simulated images. The command
+writes the printed text and a figure of the images to the folder `--out`. The command takes about a minute for 40
+trajectories. The classifier needs scikit-learn (`pip install -e '.[bench]'`).
 """
 
 import dataclasses
@@ -53,7 +53,10 @@ class Config:
 
 @dataclasses.dataclass(frozen=True)
 class Side:
-    """The real or the simulated images: the initial and the final pair of each trajectory, in this order."""
+    """The real or the simulated images.
+
+    Each trajectory has two successive images in each stream: first the initial image, then the final image.
+    """
 
     images: gap.Streams  # images of both streams, with the number of their trajectory
     described: str  # description of the source
@@ -75,7 +78,8 @@ def session(folder: Path, sensor: Path | None, resolution: tuple[int, int]) -> S
     Raises:
         FileNotFoundError: There is no session or no sensor file.
         SensorFileError: The sensor file is damaged or describes no device.
-        ValueError: There is no confirmed trajectory, or the lens was calibrated with images of another size.
+        ValueError: The user has confirmed no trajectory of the session, or the lens was calibrated with images of
+            another size.
     """
     recordings = hardware.load_recordings(folder)
     size = f"{resolution[0]} x {resolution[1]}"
@@ -139,7 +143,10 @@ def side(visual: np.ndarray, tactile: np.ndarray, numbers: np.ndarray, described
 
 
 def centred(image: np.ndarray, resolution: tuple[int, int]) -> np.ndarray:
-    """Crop a rectified image at its centre to the aspect ratio of `resolution`, and average it to `resolution`."""
+    """Crop a rectified image at its centre, and resize the crop to `resolution` by averaging pixels.
+
+    The crop has the aspect ratio of `resolution`.
+    """
     (height, width), (rows, columns) = image.shape[:2], resolution
     scale = min(height / rows, width / columns)
     tall, wide = round(rows * scale), round(columns * scale)
@@ -233,7 +240,7 @@ def written(estimate: gap.Estimate, digits: int) -> str:
 
 
 def draw(config: Config, real: Side, simulated: Side, *, matched: bool) -> None:
-    """Draw the first trajectories into `gap.png`."""
+    """Draw the initial and the final images of the first trajectories into `gap.png`."""
     rows = config.rows
     numbers = np.unique(real.images.group)[:rows]
     others = numbers if matched else np.unique(simulated.images.group)[:rows]

@@ -1,4 +1,4 @@
-"""Predict the images at rest from live images about ten times a second, and show the live and the predicted images.
+"""Predict images of the object at rest from live images about ten times a second, and show live and predicted images.
 
     python -m experiments.live                                            # starts a digital twin and opens a page
     python -m experiments.live --sensor bench                             # the sensor of a sensor file
@@ -8,10 +8,10 @@
     python -m experiments.live --replay visual.mp4 tactile.mp4 --sensor bench
     python -m experiments.live --headless --seconds 20 --save live.png    # without a page
 
-The page shows the newest visual and tactile image, the predicted images at rest, and the probabilities of the outcomes.
-The page also shows if the object touches the pad, and the rate and the latency of the predictions. The default model
-was trained in simulation on one class of object: a small camera that a hand holds and releases. At the first start, a
-twin compiles for about two minutes, and the model compiles for half a minute.
+The page shows the newest visual and tactile image, the predicted images of the object at rest, and the probabilities of
+the outcomes. The page also shows whether the object touches the pad, and the rate and the latency of the predictions.
+The default model was trained only on simulated objects of the class `camera`, which are small cameras that a hand holds
+and releases. At the first start, the compilation takes about two minutes for a twin and half a minute for the model.
 """
 
 import collections
@@ -134,7 +134,7 @@ def check(config: Config) -> None:
 
 @contextlib.contextmanager
 def opened(config: Config) -> Iterator[Source]:
-    """Make the source that the options select. A twin is started now and stopped afterwards."""
+    """Make the source that the options select. A twin starts on entry to the context, and stops on exit."""
     if config.replay:
         yield replayed(config)
     elif config.camera is not None and config.leds is not None and config.sensor is None:
@@ -161,12 +161,13 @@ def replayed(config: Config) -> Source:
 
 
 def views(config: Config, source: Source, first: hardware.Shot) -> Views:
-    """Make the conversion from raw images to the view of the sensor.
+    """Make the conversion from raw images to rectified images, which show the view of the sensor's pinhole camera.
 
     Args:
         config: Options of the command line.
         source: Source of the images.
-        first: Any image of the source. Without a sensor file, an ideal lens for images of this size is assumed.
+        first: Any image of the source. Without a sensor file, an ideal lens for images of the size of `first` is
+            assumed.
     """
     if source.file is None:
         height, width = first.image.shape[:2]
@@ -266,7 +267,10 @@ class Screen:
 
 
 def follow(config: Config, source: Source, predictor: sts.Predictor, page: LivePage | None) -> None:
-    """Connect the source, then show, predict and record its images until it ends or the user stops the command."""
+    """Connect the source, and process its images until the source ends or the user stops the command.
+
+    The command shows the images, predicts from the newest images, and records the images if `--record` is given.
+    """
     name = config.scenario or (config.model if config.model in SCENARIOS else None)
     outcomes = () if name is None else tuple(str(outcome) for outcome in SCENARIOS[name].outcomes)
     with source.sensor as sensor, contextlib.ExitStack() as stack:

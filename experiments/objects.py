@@ -53,11 +53,12 @@ class Config:
 
 @jax.jit(static_argnames=("size",))
 def portrait(body: sts.objects.Body, direction: jax.Array, *, size: int) -> jax.Array:
-    """Render a body in front of white. Flat objects are seen from higher up.
+    """Render an object in front of a white background.
 
     Args:
         body: The object.
-        direction: Direction from the object to the camera, shape (3,).
+        direction: Direction from the object to the camera, shape (3,). If the object is flat and the z component is
+            between 0 and 0.9, the camera looks down from a higher direction instead.
         size: Side of the picture (pixels).
 
     Returns:
@@ -102,7 +103,7 @@ def main(config: Config) -> None:
     """Make the objects, print their descriptions, and draw them in one picture.
 
     Raises:
-        ValueError: `num` is less than 1, a class is unknown, or the suffix of `out` is not that of a picture.
+        ValueError: `num` is less than 1, a class is unknown, or `out` does not have the suffix of a picture file.
         OSError: The picture cannot be written.
     """
     if config.num < 1:

@@ -12,17 +12,18 @@
     python -m experiments.real review --sheet review.png    # draws the last 20
     python -m experiments.real review --discard 3 17
 
-The default sub-command is `train`. It trains VAE visual, VAE tactile and MVAE without pose on the trajectories in
-`WORKDIR/dataset`. The models learn to predict the images of the object at rest from the images of the held object.
-Results go to `WORKDIR/table2`. A work directory cannot contain trajectories of both a device and the twin, so give the
-twin a separate `--workdir`.
+The default sub-command is `train`. This sub-command trains three models on the trajectories in `WORKDIR/dataset`. The
+models are called "VAE visual", "VAE tactile" and "MVAE without pose". The models learn to predict the images of the
+object at rest from the images of the held object. Results go to `WORKDIR/table2`. A work directory cannot contain
+trajectories of both a device and the twin, so give the twin a separate `--workdir`.
 
-`--sensor` is the sensor file of `experiments.commission`. It contains the lens and images of the empty pad, which
-training needs.
+`--sensor` is the sensor file of `experiments.commission`. The sensor file contains the lens and images of the empty
+pad. Training needs the lens and these images.
 
-`collect` guides a person through trajectories: place the object in an unstable pose, hold it, release it, wait until it
-rests. The initial and the final pair of images are saved at once, raw and uncropped, into `WORKDIR/dataset`. Confirmed
-trajectories survive an interruption. After an interruption, the same command continues with the next trajectory.
+`collect` guides a person through trajectories: place the object in an unstable pose, hold the object, release the
+object, and wait until the object rests. The initial pair and the final pair of images are each saved immediately, raw
+and uncropped, into `WORKDIR/dataset`. Confirmed trajectories survive an interruption. After an interruption, the same
+command continues with the next trajectory.
 """
 
 import argparse

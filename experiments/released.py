@@ -1,4 +1,4 @@
-"""Predict the images and the pose at rest of a small camera that a hand releases, from a frame in which it is held.
+"""Predict the images and the pose at rest of an object that a hand releases, from a frame that shows the held object.
 
     python -m experiments.released                    # 26 minutes on one CPU core of a computer with other work
     python -m experiments.released --preset long      # has not been run to the end yet, resumes after an interruption
@@ -7,10 +7,11 @@
     python -m experiments.released --preset paper     # the paper's counts and schedule: hours, a GPU helps
     python -m experiments.released --plan             # prints the expected seconds of each stage
 
-This is the simulated counterpart of the paper's real dataset. Results go to `runs/released/`: config.json, dataset/,
-models/NAME/, metrics.json, table.md and figures/*.png. A second run with the same `--workdir` resumes after an
-interruption, and leaves finished results unchanged. `--only train` runs one stage. Every field of the configuration is
-an option too, such as `--collection.num-objects 1000`, see `--help`.
+The objects are small cameras (object class `camera`). This experiment is the simulated counterpart of the paper's real
+dataset. Results go to `runs/released/`: config.json, dataset/, models/NAME/, metrics.json, table.md and figures/*.png.
+A second run with the same `--workdir` resumes after an interruption, and leaves finished results unchanged.
+`--only train` runs one stage. Every field of the configuration is an option too, such as
+`--collection.num-objects 1000`, see `--help`.
 """
 
 import dataclasses

@@ -94,15 +94,15 @@ def check(config: Config) -> None:
 
 
 def read(config: Config, name: str) -> sts.objects.Body:
-    """Load the object from a mesh file, or make an object of a class.
+    """Load the object from a mesh file, or generate an object of an object class such as `bottle`.
 
     Args:
         config: Options of the command line.
-        name: Path of a mesh file, or name of a class.
+        name: Path of a mesh file, or name of an object class.
 
     Raises:
-        FileNotFoundError: The name is neither a file nor a class.
-        ValueError: An option for mesh files is given for a class, or `objects.load` refuses the file.
+        FileNotFoundError: The name is neither a file nor an object class.
+        ValueError: An option for mesh files is given for an object class, or `objects.load` refuses the file.
     """
     if name not in sts.objects.CATEGORIES:
         path = Path(name)
@@ -138,8 +138,8 @@ def lay(config: Config, sensor: sts.Sensor, body: sts.objects.Body) -> tuple[np.
     """Place the object at rest (`physics.place`), then tilt, turn and move it as the options require.
 
     Returns:
-        The pose of the object in the sensor frame, shape (7,), the force and moment of the pad on it, shape (6,), and a
-        description of how it rests.
+        Three values. The first value is the pose of the object in the sensor frame, shape (7,). The second value is the
+        force and moment that the pad exerts on the object, shape (6,). The third value describes how the object rests.
 
     Raises:
         ValueError: The object has no face with the index `rest`.
@@ -189,7 +189,7 @@ def look(config: Config, sensor: sts.Sensor, body: sts.objects.Body) -> tuple[st
     """Place and render the object.
 
     Returns:
-        The frame, an image with the LEDs at `config.light` times full power, and a description of three lines.
+        The frame, an image with the LEDs at `config.light` times full power, and a description that has three lines.
     """
     pose, wrench, words = lay(config, sensor, body)
     given = sensor, body, jnp.asarray(pose, jnp.float32), jnp.asarray(wrench, jnp.float32)

@@ -51,7 +51,7 @@ def ship(workdir: Path, name: str) -> str:
     if not name.isidentifier():
         raise ValueError(
             f"the name is {name!r}, but it must consist of letters, digits and underscores, and must not begin with a "
-            "digit: give another one, such as --name freefall"
+            "digit: give another name, such as --name freefall"
         )
     original = sts.Predictor.load(workdir / "models" / "statespace")
     MODELS.mkdir(exist_ok=True)

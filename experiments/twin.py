@@ -2,7 +2,7 @@
 
     python -m experiments.twin                                          # commands hold and release the object
     python -m experiments.twin --release-every 6 --port twin-leds       # random releases, port with a fixed name
-    python -m experiments.twin --resolution 1232 1640 --rate 5          # images of the size of the paper's camera
+    python -m experiments.twin --resolution 1232 1640 --rate 5          # image size of the paper's camera
 
 The command prints the addresses of the twin and runs until Ctrl-C. The first start compiles for about two minutes.
 Later starts take about 20 s.

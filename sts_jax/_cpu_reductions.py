@@ -24,7 +24,7 @@ def maximum(values: Array) -> Array:
 
 
 def cumsum(counts: Array) -> Int[Array, "n"]:
-    """Cumulative sum of a vector of integers or flags, computed by products with triangular matrices.
+    """Cumulative sum of a vector of integers or flags, computed in float32 by products with triangular matrices.
 
     The sum of all values must be below 2^24, because float32 cannot represent every integer above this limit.
     """

@@ -206,13 +206,13 @@ def flush_folder(folder: Path) -> None:
 
 
 def write_folder(path: Path, files: dict[str, bytes]) -> None:
-    """Create a folder with files atomically. An interruption leaves no folder of this name.
+    """Create a folder with files atomically. An interruption leaves either the complete folder or the previous state.
 
     All files are on disk when the function returns.
 
     Args:
         path: The folder. A folder that already exists must be empty.
-        files: The content of each file by its name.
+        files: Dictionary from the name of a file to the content of the file.
 
     Raises:
         OSError: A file cannot be written, or `path` is a file or a non-empty folder. The message names the folder and

@@ -21,8 +21,8 @@ def bilinear(
     Args:
         image: Values of the pixels. There may be any number of axes *c for channels. If `wrap` is False, the image must
             have at least 2x2 pixels.
-        column: Columns of the points (pixels). The column is a whole number at the centre of a pixel.
-        row: Rows of the points (pixels). The row is a whole number at the centre of a pixel.
+        column: Columns of the points (pixels). The centre of a pixel has a whole number as its column.
+        row: Rows of the points (pixels). The centre of a pixel has a whole number as its row.
         wrap: If True, the image repeats beyond its border. If False, a point outside has the value of the nearest point
             inside.
 
@@ -49,8 +49,8 @@ def bilinear_batch(
 
     Args:
         images: Images with c channels, at least 2x2 pixels each.
-        column: Columns of the points in each image (pixels). The column is a whole number at the centre of a pixel.
-        row: Rows of the points in each image (pixels). The row is a whole number at the centre of a pixel.
+        column: Columns of the points in each image (pixels). The centre of a pixel has a whole number as its column.
+        row: Rows of the points in each image (pixels). The centre of a pixel has a whole number as its row.
 
     Returns:
         Values at the points. A point outside its image has the value of the nearest point inside.
@@ -79,7 +79,8 @@ def shifted(
         shape: Height h and width w of the image without the border (pixels).
 
     Returns:
-        Image. Its pixel at row i and column j has the value of the given image at row i + rows and column j + columns.
+        Shifted image (h, w). The pixel at row i and column j has the value of the image without the border at row
+        i + rows and column j + columns, or a value of the border if this point is outside the image.
     """
     height, width = shape
     columns, rows = jnp.clip(columns, -width, width), jnp.clip(rows, -height, height)

@@ -25,13 +25,14 @@ def enable_compilation_cache(folder: str | os.PathLike[str] | None = None) -> Pa
     `import jax` to hide the message.
 
     Args:
-        folder: Folder of the cache. None selects the folder that the environment variable JAX_COMPILATION_CACHE_DIR
-            names. If that variable is set to an empty string, nothing is cached. If the variable is not set, the cache
-            is a folder in `$XDG_CACHE_HOME/sts_jax`, by default in `~/.cache/sts_jax`. Each kind of processor has its
-            own folder there, because a program that was compiled for one kind may not run on another.
+        folder: Folder of the cache. None selects the folder in the environment variable JAX_COMPILATION_CACHE_DIR. If
+            that variable is set to an empty string, nothing is cached. If the variable is not set, the cache is a
+            folder in `$XDG_CACHE_HOME/sts_jax`, by default in `~/.cache/sts_jax`. Each kind of processor has its own
+            folder there, because a program that was compiled for one kind may not run on another.
 
     Returns:
-        The folder, or None if JAX_COMPILATION_CACHE_DIR is empty.
+        The folder of the cache. The result is None if `folder` is None and JAX_COMPILATION_CACHE_DIR is set to an empty
+        string.
 
     Raises:
         OSError: The folder cannot be created.

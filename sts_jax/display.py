@@ -50,7 +50,7 @@ def show(thing: Frame | Body | Prediction | ArrayLike, *, title: str = "") -> Fi
         A Matplotlib figure.
 
     Raises:
-        TypeError: `thing` has none of these types.
+        TypeError: `thing` is not a `Frame`, a `Body`, a `Prediction` or an array.
         ValueError: `thing` is a batch, a prediction without images, or an image with an invalid shape, type or range.
     """
     panels = _panels(thing)
@@ -120,8 +120,8 @@ def save(path: str | os.PathLike[str], thing: Frame | Body | Trajectory | ArrayL
 
     Raises:
         TypeError: The format cannot store an item of this type.
-        ValueError: The suffix of the path is not `.npz` or `.png`, the shape, type or range of the image is invalid, or
-            a batch of frames was given for a `.png` file.
+        ValueError: The path has a suffix other than `.npz` or `.png`. This error is also raised for an image with an
+            invalid shape, type or range, and for a batch of frames if the path ends in `.png`.
         OSError: The file cannot be written.
     """
     path = Path(path)
@@ -186,7 +186,7 @@ def load(path: str | os.PathLike[str]) -> Any:
     except Exception as error:  # A damaged zip file raises exceptions of many types.
         reason = f"{type(error).__name__}: {error}"
         raise DamagedFileError(
-            f"{path} is damaged or was not written by sts.save ({reason}). Save it again."
+            f"{path} is damaged or was not written by sts.save ({reason}). Save the item again."
         ) from error
 
 
@@ -207,8 +207,8 @@ def _check_single(name: str, array: Any, rank: int) -> None:
     """Raise a ValueError if an array of a single item, which has `rank` axes, has leading axes."""
     if np.ndim(array) != rank:
         raise ValueError(
-            f"the {name} has leading axes {np.shape(array)[: np.ndim(array) - rank]}, but it must be one item. Select "
-            "the first one with jax.tree.map(lambda x: x[0], batch)"
+            f"the {name} has leading axes {np.shape(array)[: np.ndim(array) - rank]}, but a single item is needed. "
+            "Select the first item with jax.tree.map(lambda x: x[0], batch)"
         )
 
 

@@ -259,7 +259,7 @@ def test_an_invalid_split_is_refused(copied, change, message):
         ("split.json", b"7", r"split\.json must have the parts train, validation, test, got a int"),
         ("collection.json", None, r"collection\.json is missing: .* is not a collected dataset"),
         ("collection.json", b"\xff", r"collection\.json cannot be read as JSON"),
-        ("collection.json", b"[]", r"collection\.json does not describe a collection"),
+        ("collection.json", b"[]", r"collection\.json does not describe a dataset"),
         (
             "collection.json",
             b'{"format": 4}',
@@ -293,7 +293,8 @@ def test_an_older_dataset_must_be_collected_again(copied, older):
     path.write_text(json.dumps(content if older == 1 else {**content, "format": older}))
     for use in (dataset.load, lambda folder: dataset.collect(SMALL, sts.Sensor(), folder)):
         with pytest.raises(
-            ValueError, match=rf"is a dataset of format {older}, and this version reads format 4: delete .* and"
+            ValueError,
+            match=rf"is a dataset of format {older}, but this version of sts_jax reads format 4: delete .* and",
         ):
             use(copied)
 

@@ -47,7 +47,7 @@ def jpeg(image: Image) -> bytes:
 class MotionJpeg:
     """A server of a motion JPEG stream. Its attribute `mode` selects a fault, and may change at any time.
 
-    The server reads these modes before each frame:
+    The following modes apply to each frame:
 
     - `live`: send numbered frames.
     - `skip`: leave out the numbers in `skipped`.
@@ -59,7 +59,7 @@ class MotionJpeg:
     - `held`: keep the frames back, and send them all at once when the mode changes.
     - `close`: close the connection.
 
-    It reads these modes at each request:
+    The following modes apply to new requests only:
 
     - `hang`: send no answer.
     - `missing`: answer with status 404.
@@ -87,7 +87,7 @@ class MotionJpeg:
         return f"http://127.0.0.1:{self.port}/video"
 
     def start(self) -> None:
-        """Listen for requests. After `stop`, the server listens at the same port as before."""
+        """Listen for requests. If the server was stopped before, it listens at its previous port again."""
         server = self
 
         class Handler(http.server.BaseHTTPRequestHandler):

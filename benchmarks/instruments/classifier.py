@@ -1,6 +1,6 @@
 """Loss of a classifier on unseen objects, with confidence intervals over objects.
 
-Rows of the arrays are items, such as trajectories or images. `groups` has the number of the object of each item.
+Rows of the arrays are items, such as trajectories or images. `groups` has the index of each item's object.
 Cross-validation folds and bootstrap samples contain all items of an object or none.
 """
 
@@ -70,7 +70,10 @@ def gain(before: np.ndarray, after: np.ndarray, weight: np.ndarray) -> float:
 
 
 def kept(before: np.ndarray, after: np.ndarray, other: np.ndarray, weight: np.ndarray) -> float:
-    """Gain from `before` to `other`, divided by the gain from `before` to `after`. These three are losses, `(n,)`."""
+    """Gain from `before` to `other`, divided by the gain from `before` to `after`.
+
+    The arrays `before`, `after` and `other` are losses, `(n,)` each.
+    """
     return gain(before, other, weight) / gain(before, after, weight)
 
 

@@ -18,9 +18,10 @@ Weights = list[tuple[Array, Array]]
 
 
 def initial(key: PRNGKeyArray, outputs: int) -> Weights:
-    """Draw the weights of three convolutions and two dense layers from a He normal distribution.
+    """Make the initial weights of three convolutions and two dense layers.
 
-    The last layer is zero, so the untrained network predicts zero.
+    The weights are drawn from a He normal distribution, except in the last layer. The weights of the last layer are
+    zero, so that the untrained network predicts zero.
     """
     widths = [12, *CHANNELS]
     shapes = [(3, 3, a, b) for a, b in itertools.pairwise(widths)]
@@ -58,13 +59,13 @@ def fit(
     Args:
         key: Random key.
         images: Training images, uint8 `(n, h, w, 3)`.
-        targets: Float `(n, k)`, for the squared error of the standardised targets, or bool `(n, k)`, for the
-            cross-entropy.
+        targets: Float or bool `(n, k)`. This function standardises float targets, and the loss is the squared error.
+            For bool targets, the loss is the cross-entropy.
         steps: Number of steps of Adam, with BATCH images each.
 
     Returns:
-        A function from images, uint8 `(m, h, w, 3)`, to predictions, `(m, k)`. They are logits if `targets` is bool,
-        and otherwise in the unit of `targets`.
+        A function from images, uint8 `(m, h, w, 3)`, to predictions, `(m, k)`. The predictions are logits if
+        `targets` is bool, and otherwise have the unit of `targets`.
     """
     logits = targets.dtype == bool
     centre, scale = (0.0, 1.0) if logits else (targets.mean(0), targets.std(0))

@@ -51,7 +51,7 @@ def weighed(starts: Starts) -> np.ndarray:
 
 
 def canonical(pose: np.ndarray, condition: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotate or mirror starts by a symmetry of the square pad, so that the push points 0 to 45 degrees from +x.
+    """Rotate or mirror starts by a symmetry of the square pad. The push is then directed 0 to 45 degrees from +x.
 
     The push is the acceleration of the object in the frame of the pad, opposite to the acceleration of the pad.
 
@@ -73,10 +73,11 @@ def canonical(pose: np.ndarray, condition: np.ndarray) -> tuple[np.ndarray, np.n
 def tipping(rigid: np.ndarray, base: np.ndarray, push: np.ndarray, time: np.ndarray, friction: float) -> np.ndarray:
     """Compute two ratios that decide whether a standing object topples over the edge of its base.
 
-    The object begins to tip at the acceleration g b / h, where b is the radius of the base and h the height of the
+    The object begins to tip at the acceleration g b / h, where b is the radius of the base and h is the height of the
     centre of mass. The first ratio is the acceleration divided by g b / h. The second ratio is the energy at the end of
     the push divided by the energy that lifts the centre of mass over the edge. Both ratios exceed 1 for an object that
-    topples. In the second ratio, friction limits the force, and a limited force acts for a longer time.
+    topples. The second ratio takes into account that friction limits the force of the push. A limited force acts longer
+    than `time`, so that force times duration stays the same.
 
     Args:
         rigid: Mass (kg), height of the centre of mass (m), and inertia about a horizontal axis through the centre of
@@ -107,7 +108,7 @@ def shaken(
     Args:
         scenario: The scenario.
         items: The objects.
-        starts: Their starts, one row each.
+        starts: Starts of these objects, with one row for each start.
         touch: Measured logarithm of the mass in kg, `(n, 1)`. None: return features from vision alone.
 
     Returns:

@@ -31,8 +31,8 @@ class Peer:
     - `cut`: send only the first half of the answer.
     - `joined`: send the answer twice, the first time without the end of its line.
     - `noise`: send a line of meaningless bytes before the answer.
-    - `watchdog`: send a line of the watchdog before the answer.
-    - `stale`: send the answer to another request before the answer.
+    - `watchdog`: send the message that the watchdog has turned the lights off, and then the answer.
+    - `stale`: send an answer to a different request, and then the correct answer.
     - `vanish`: unplug the controller.
 
     By default, the controller's clock runs at a hundredth of the true speed, so that its watchdog does not interfere.
@@ -52,7 +52,7 @@ class Peer:
         Args:
             path: Symbolic link to the port, which is created or replaced.
             serial_number: Serial number of the controller.
-            talk: Bytes that are sent repeatedly, with or without a request, as if the port were that of another device.
+            talk: Bytes that are sent repeatedly, with or without a request, as if the port belonged to another device.
                 None: the controller answers requests.
             clock: The controller's clock, a function that returns seconds.
             make: Function that makes the emulated controller at each boot.
@@ -101,7 +101,7 @@ class Peer:
             self._deaf_until_s = time.monotonic() + boot_s
 
     def fire_watchdog(self) -> None:
-        """Turn the lights off and send the line of the watchdog, as if no request had arrived for too long."""
+        """Turn the lights off and send the watchdog's message, as if no request had arrived for too long."""
         with self._lock:
             self.controller._valid_s = -float("inf")
             sent = self.controller.tick(self.clock())

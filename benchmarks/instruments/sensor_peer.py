@@ -43,7 +43,7 @@ class Lights:
             end_s: End of the interval (s).
 
         Returns:
-            The successive shares of the light, and their mean over time.
+            The successive levels of the light as shares of the full power, and the mean level over the interval.
         """
         with self._lock:
             changes = self._changes[-1000:]
@@ -133,7 +133,10 @@ class SeenLights(MotionJpeg):
         return jpeg(image)
 
     def exposure_of(self, image: Image) -> Exposure | None:
-        """Look up the exposure of an image by its number. None: the camera has not taken such an image."""
+        """Look up the exposure of an image by the frame number that a corner of the image shows.
+
+        Return None if the camera has not taken such an image.
+        """
         if image.shape[1::-1] != self.size or image.max() < DARK / 2:
             return None
         return self.log.get(number_of(image[:CORNER, :CORNER]))
@@ -171,7 +174,10 @@ class SensorPeer:
         return self.camera.url
 
     def plug_in(self, path: Path) -> None:
-        """Plug the controller in at the port `path`, where it boots. Its watchdog runs on the true clock."""
+        """Plug the controller in at the port `path`, so that the controller boots.
+
+        The controller's watchdog runs at the true speed. By default, the clock of `Peer` is a hundred times slower.
+        """
         self._boots += 1
         self.leds = Peer(path, clock=time.monotonic, make=functools.partial(SeenController, self.lights))
         self.leds.controller.boot = self._boots
@@ -190,7 +196,7 @@ class SensorPeer:
         return found is not None and found.shares == [1.0 if lit else 0.0]
 
     def stop(self) -> None:
-        """Unplug both devices."""
+        """Unplug the camera and the controller."""
         self.camera.stop()
         self.leds.vanish()
 

@@ -51,8 +51,8 @@ def margins(corners: np.ndarray, place: np.ndarray) -> list[float]:
         place: The point (m), `(2,)`.
 
     Returns:
-        Distance from the nearest edge (m), distance from the nearest downhill edge (m), length of this downhill edge
-        (m), and y component of its outward unit normal. Distances are positive inside of the polygon.
+        Distance from the nearest edge (m). For the nearest edge that faces downhill (+y): distance (m), length (m),
+        and y component of the outward unit normal. Distances are positive inside of the polygon.
     """
     along = np.roll(corners, -1, 0) - corners
     length = np.linalg.norm(along, axis=1) + 1e-9
@@ -66,7 +66,9 @@ def margins(corners: np.ndarray, place: np.ndarray) -> list[float]:
 def balance(
     corners: np.ndarray, centre: np.ndarray, friction: np.ndarray, slope: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Predict by statics how a body on the slope moves, and where it presses on the pad, for several hidden values.
+    """Predict by statics how a body on the slope moves, and where the body presses on the pad.
+
+    There is one prediction for each row of `centre` and `friction`, which are hidden properties of the body.
 
     Args:
         corners: Corners of the support polygon (m), `(k, 2)`.

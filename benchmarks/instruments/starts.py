@@ -1,4 +1,4 @@
-"""Numbered objects, starts and outcomes of their trajectories, and images of the starts."""
+"""Numbered objects, the starts and outcomes of the objects' trajectories, and images of the starts."""
 
 import concurrent.futures
 import os
@@ -35,10 +35,10 @@ class Starts(NamedTuple):
 
 
 def bodies(categories: tuple[str, ...], count: int, first: int = 0) -> list[objects.Body]:
-    """Make objects of the given classes in turn.
+    """Make objects of the given classes, such as "bottle", in turn.
 
     Args:
-        categories: Classes of the objects.
+        categories: Names of the classes.
         count: Number of objects.
         first: Number of the first object. The number of an object is the seed of its random key, and selects its class.
     """
@@ -47,7 +47,9 @@ def bodies(categories: tuple[str, ...], count: int, first: int = 0) -> list[obje
 
 
 def filled(body: objects.Body, fill: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mass properties of a body with several fill levels, a nominal shell, and contents that settled along +z.
+    """Mass properties of a body at several fill levels.
+
+    The shell has the nominal mass. The contents settled while +z of the mesh frame pointed upwards.
 
     Args:
         body: The body.
@@ -61,7 +63,7 @@ def filled(body: objects.Body, fill: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def rigid_of(items: list[objects.Body], traj: physics.Trajectory) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mass properties of the objects of trajectories, which must be sorted by object.
+    """Mass properties of the object of each trajectory. The trajectories must be sorted by object.
 
     Args:
         items: The objects.
@@ -87,7 +89,7 @@ def roll(
     again: int = 0,
     reroll: tuple[str, ...] = (),
 ) -> Starts:
-    """Simulate starts of each object, and some of these starts a second time with other contents.
+    """Simulate starts of each object, and some of these starts a second time with other hidden properties.
 
     Args:
         key: Random key.
@@ -95,7 +97,7 @@ def roll(
         scenario: The scenario.
         num: Number of starts of each object.
         again: Number of starts of each object that are simulated a second time.
-        reroll: Fields of `physics.Hidden` that are drawn again for the second time.
+        reroll: Fields of `physics.Hidden` that are drawn again for the second simulation.
     """
     key, fresh = jax.random.split(key)
     with tqdm(total=len(items) * num, unit="starts") as bar:

@@ -1,4 +1,4 @@
-"""Background images of a sensor file: means of many images of the empty pad."""
+"""Background images for a sensor file. Each background is the mean of many images of the empty pad in one stream."""
 
 import dataclasses
 import math
@@ -31,7 +31,7 @@ class _Mean(NamedTuple):
 
 
 def record(sensor: PairReader) -> Backgrounds:
-    """Take pairs of images of the empty pad, and average them.
+    """Take pairs of visual and tactile images of the empty pad, and compute the mean image of each stream.
 
     Args:
         sensor: Connected sensor. Its pad must be empty, and nothing may move.

@@ -52,7 +52,7 @@ def wait(text: str, every: float | None) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class Pictures:
-    """The pictures of a folder in the order of their names. In the first one, the board lies on the pad."""
+    """The pictures of a folder in the order of their names. In the first picture, the board lies on the pad."""
 
     folder: Path  # folder of the PNG files
     board: hardware.Board  # geometry of the printed board
@@ -99,7 +99,10 @@ class Pictures:
         return dataclasses.replace(self, names=names, found=(*there[:place], found, *there[place:]))
 
     def describe(self) -> str:
-        """Text with the number of image parts (`PARTS`) that contained the board, and the names of the other parts."""
+        """Return a text about the parts of the image (`PARTS`) in which the board was found at least once.
+
+        The text contains the number of these parts and the names of the other parts.
+        """
         there = hardware.covered(self.found, self.size)
         missing = [part for part in PARTS if part not in there]
         return f"{len(there)} of {len(PARTS)} parts of the image covered" + (
@@ -107,13 +110,15 @@ class Pictures:
         )
 
     def fit(self, pinhole: hardware.Pinhole) -> hardware.Calibration:
-        """Calibrate the lens, and check that it covers the view of the sensor.
+        """Calibrate the lens, and check that the lens and the pictures cover the view of the sensor.
+
+        The view is the part of the gel's outer face that rectified images show.
 
         Args:
-            pinhole: View of the sensor.
+            pinhole: Pinhole camera that defines the view of the sensor.
 
         Raises:
-            CalibrationError: The pictures do not determine the lens, or the lens does not cover the view.
+            CalibrationError: The pictures do not determine the lens, or the lens or the pictures do not cover the view.
         """
         try:
             calibration = hardware.fit_lens(self.found, self.size, self.board)

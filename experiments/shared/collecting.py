@@ -49,8 +49,8 @@ def device(config: Collect) -> tuple[hardware.STS, EmptyPad | None]:
     """Make the sensor that the options describe.
 
     Returns:
-        The sensor, which is not connected yet, and the empty pad from the backgrounds of the sensor file. The empty
-        pad is None if there are no backgrounds.
+        The sensor, which is not connected yet, and the appearance of the empty pad. The appearance is computed from the
+        background images of the sensor file, and is None if there are no background images.
 
     Raises:
         ValueError: An option is missing or out of range, or contradicts the sensor file.
@@ -75,7 +75,7 @@ def device(config: Collect) -> tuple[hardware.STS, EmptyPad | None]:
 
 
 def commissioned(config: Collect, file: Path) -> tuple[hardware.STS, EmptyPad | None]:
-    """Make the sensor of a sensor file. `device` describes the results and errors."""
+    """Make the sensor that a sensor file describes. See the function `device` for the return values and exceptions."""
     for name, value in (("size", config.size), ("levels", config.levels)):
         if value is not None:
             raise ValueError(
@@ -91,7 +91,9 @@ def commissioned(config: Collect, file: Path) -> tuple[hardware.STS, EmptyPad | 
 
 
 def collect(config: Collect) -> None:
-    """Connect the sensor, and guide and save trajectories until there are enough or the user stops the command.
+    """Connect the sensor, guide a person through trajectories, and save the trajectories.
+
+    The collection ends when there are enough trajectories or the user stops the command.
 
     Raises:
         ValueError: An option is missing or out of range, or contradicts a file in the work directory.
@@ -134,10 +136,10 @@ def collect(config: Collect) -> None:
 
 
 def of_twin(config: Collect) -> simulated.Simulated:
-    """Convert the options to those of a collection with the twin.
+    """Convert the options of `collect` to the options of a collection with the digital twin.
 
     Raises:
-        ValueError: An option is out of range, or names a device.
+        ValueError: An option is out of range, or an option for a real device is given.
     """
     devices = {"camera": config.camera, "leds": config.leds, "sensor": config.sensor, "fourcc": config.fourcc}
     for name, value in devices.items():
@@ -188,7 +190,7 @@ def keep(file: Path, workdir: Path) -> None:
 def person(config: Collect) -> Iterator[Person]:
     """Make the page or terminal that shows instructions to a person and receives the person's actions.
 
-    The page is closed afterwards.
+    The page is closed at the end of the `with` block.
 
     Raises:
         OSError: The address of the page cannot be used.

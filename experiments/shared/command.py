@@ -158,7 +158,7 @@ def with_meshes(
     scale: float | None = None,
     up: Literal["x", "y", "z"] | None = None,
 ) -> dataset.Collection:
-    """Replace the objects of a collection by those of a folder, and keep about the same number of trajectories.
+    """Replace the objects of a collection by the objects of a folder, and keep about the same number of trajectories.
 
     The objects are listed in `objects.txt` in the work directory.
 

@@ -100,7 +100,9 @@ def smoke(default: Config) -> Config:
 
 
 def paper(collection: dataset.Collection, *, num_objects: int, num_per_object: int) -> Config:
-    """Make the configuration of the paper: its models, its schedule and its choices, with all frames rendered.
+    """Make the configuration with the models, the training schedule and the options of the paper.
+
+    All frames of all trajectories are rendered.
 
     Args:
         collection: Collection of the default experiment, with the scenario and the object classes.

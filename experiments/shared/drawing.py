@@ -23,9 +23,10 @@ def draw(
     shown: Mapping[str, evaluation.Predicted],
     possible: Ceilings,
 ) -> list[Path]:
-    """Draw the predictions of the main model from vision and from all inputs, and how well they are calibrated.
+    """Draw the main model's predictions from vision and from all inputs, and the calibration of outcome probabilities.
 
-    A further figure shows predicted and re-rolled positions at rest, if the model predicts samples of the pose.
+    If the model predicts samples of the pose, further figures show the predicted and the re-rolled positions at rest.
+    A re-roll is another simulation of the same start with newly drawn hidden properties.
 
     Args:
         config: Configuration of the experiment.
@@ -33,8 +34,8 @@ def draw(
         figures: Folder for the figures.
         sensor: Sensor of the collection.
         test: Held-out trajectories.
-        scores: Scores by title of the row in the tables.
-        shown: Predictions of the first held-out trajectories, by title of the row.
+        scores: Scores of the predictions. The keys are the titles of the rows in the tables.
+        shown: Predictions of the first held-out trajectories. The keys are the titles of the rows.
         possible: Re-rolls of the first held-out starts.
 
     Returns:

@@ -28,7 +28,7 @@ class Line(NamedTuple):
 
 
 class Rate(NamedTuple):
-    """The measured duration of one item, and of the compilation."""
+    """The measured durations of one item (trajectory, frame or gradient step) and of the compilation."""
 
     each: float  # duration of one item (s)
     compiling: float  # duration of the compilation, which happens once (s)
@@ -41,12 +41,13 @@ class Rate(NamedTuple):
 def plan(config: Config, *, num: int = 64, steps: int = 4) -> str:
     """Run a small part of each stage, and estimate the duration of the whole experiment.
 
-    Each part runs twice, because the first run includes the compilation.
+    The simulation and the rendering run twice. Only the first run includes the compilation, so the difference between
+    the two durations is the duration of the compilation.
 
     Args:
         config: Configuration of the experiment.
         num: Number of simulated trajectories. The first and the last frame of each trajectory are rendered once for
-            each symmetry of the scenario.
+            each symmetry (rotation or reflection) of the scenario.
         steps: Number of gradient steps of each model.
 
     Returns:

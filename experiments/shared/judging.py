@@ -23,8 +23,9 @@ MAIN_SUBSETS = (
 class SplitPairs(NamedTuple):
     """The first and last frames of a split.
 
-    The images of `validation` and `given` have the resolution of the models' inputs. The images of `train` and `test`
-    have the resolution `image_size`.
+    The fields `given` and `test` contain the same held-out trajectories, as inputs and as targets. The images of
+    `validation` and `given` have the resolution of the models' inputs. The images of `train` and `test` have the
+    resolution `config.image_size`, in which predictions are scored.
     """
 
     train: dataset.Pairs  # training trajectories
@@ -34,7 +35,7 @@ class SplitPairs(NamedTuple):
 
 
 def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sensor, split: str) -> str:
-    """Score every model on held-out trajectories, and write and return the results.
+    """Score every model on held-out trajectories, write the results to files, and return the main table.
 
     The results are `metrics.json`, `table.md`, `table-full.md` and `figures/` in the work directory. `metrics.json`
     records the checksums of all inputs and results. While all checksums match, nothing is evaluated again. If `split`
@@ -111,10 +112,10 @@ def _pairs_of_split(config: Config, data: dataset.Dataset, split: str) -> SplitP
 
 
 def queries(config: Config, workdir: Path, split: str) -> Iterator[tuple[str, sts.Predictor, tuple[str, ...]]]:
-    """Combine every model with every subset of the inputs that it supports.
+    """Combine each model with each subset of the inputs that the model supports.
 
     Yields:
-        The title of the row in the tables, the model, and the names of its inputs.
+        The title of the row in the tables, the model, and the names of the inputs in the subset.
     """
     for name in MODELS[config.model]:
         predictor = sts.Predictor.load(model_folder(workdir, name, config, split))
@@ -157,7 +158,9 @@ def _scored(
 
 
 def main_rows(model: str, titles: Sequence[str]) -> list[str]:
-    """Row titles of the main table: the ceiling, the baselines, and the main model with up to five sets of inputs.
+    """Titles of the rows of the main table: ceiling, baselines, and the main model with up to five sets of inputs.
+
+    The ceiling is the score of the mean of repeated simulations with newly drawn hidden properties (re-rolls).
 
     Args:
         model: Title of the main model.

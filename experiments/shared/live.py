@@ -81,14 +81,14 @@ class Views:
     def prepared(self, visual: Image, tactile: Image, empty: Mapping[str, np.ndarray]) -> hardware.SensorView:
         """Convert raw images to the inputs of a model.
 
-        If `backgrounds` is not None and its field `divided` is True, the brightness and the colours are adapted to
-        those of the model's training images (`hardware.relit`).
+        If `backgrounds` is not None and `backgrounds.divided` is True, the brightness and the colours of the images are
+        adapted to the training images of the model (`hardware.relit`).
 
         Args:
             visual: Raw visual image.
             tactile: Raw tactile image.
-            empty: Images of the untouched sensor in the model's training (`Predictor.empty`). Their size is the
-                resolution of the result.
+            empty: Images of the untouched sensor in the model's training (`Predictor.empty`). The result has
+                the same resolution as these images.
         """
         model = hardware.SensorView(**empty)
         rows, columns = model.visual.shape[:2]
@@ -120,13 +120,14 @@ class Live:
     ):
         """Compile the model, and start the thread.
 
-        The compilation takes about half a minute at the first time on a machine.
+        The first compilation on a machine takes about half a minute.
 
         Args:
             predictor: Trained model. Visual images must be among its inputs.
             views: Conversion from raw images to the view of the sensor.
-            outcomes: Names of the outcomes of the model's scenario, in the scenario's order. If the model predicts
-                another number of outcomes, the names are `outcome 0`, `outcome 1` and so on.
+            outcomes: Names of the outcomes of the model's scenario, in the scenario's order. If the number of
+                names differs from the number of predicted outcomes, the names `outcome 0`, `outcome 1` and so on are
+                used.
             condition: Known quantities of the scenario that the model receives (SI units). An empty tuple stands for
                 zeros.
             show: Function that the thread calls after each prediction. The latency includes this call.

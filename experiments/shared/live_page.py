@@ -23,7 +23,7 @@ class LivePage(Site):
             title: Text that names the source and the model.
 
         Raises:
-            OSError: The address cannot be used. The message names it and the remedy.
+            OSError: The address cannot be used. The message names the address and the remedy.
         """
         self._title = title
         self._seen: Seen | None = None

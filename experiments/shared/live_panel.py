@@ -52,7 +52,7 @@ def panel(seen: Seen) -> UInt8[np.ndarray, "height width 3"]:
 
 
 def lines(seen: Seen) -> list[str]:
-    """The rate, the latency, the contact and the remark on the source, as lines of text."""
+    """The prediction rate, the latency, the contact state and the remark on the image source, as lines of text."""
     found = seen.predicted
     latency = "" if seen.latency_s is None else f"latency {1000 * seen.latency_s:.0f} ms"
     known = found is not None and found.contact is not None
@@ -72,7 +72,7 @@ class PanelFile:
             path: Path of the file. Its suffix selects a picture or a video.
 
         Raises:
-            ValueError: The suffix is neither that of a picture nor that of a video.
+            ValueError: The suffix is neither a picture suffix nor a video suffix.
             OSError: The file cannot be written.
         """
         self._path = path
@@ -89,7 +89,7 @@ class PanelFile:
         self._next_s = -float("inf")  # time at which the next panel is due (s)
 
     def add(self, seen: Seen) -> None:
-        """Draw and add a panel if the next one is due and the model has made predictions.
+        """Draw a panel and add the panel to the file, if a panel is due and the model has made predictions.
 
         Raises:
             OSError: The video cannot be written.

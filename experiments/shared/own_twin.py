@@ -1,4 +1,4 @@
-"""Starts a digital twin in another process, commissions it, and holds and releases its object."""
+"""Starts a digital twin in another process, writes the twin's sensor file, and holds and releases its object."""
 
 import contextlib
 import json
@@ -67,7 +67,7 @@ class OwnTwin:
 
 @contextlib.contextmanager
 def own_twin(folder: Path, *, seed: int = 0) -> Iterator[OwnTwin]:
-    """Start a twin, commission it, and stop it afterwards.
+    """Start a twin, write the twin's sensor file with `experiments.commission`, and stop the twin afterwards.
 
     Args:
         folder: Empty folder, which receives the sensor file and the link to the serial port.

@@ -12,7 +12,7 @@ _STREAMS = ("visual", "tactile")
 
 
 class Page(Site):
-    """Shows views to a person in a browser, and returns the person's actions (a `hardware.Person`)."""
+    """A `hardware.Person` that shows each view in a browser, and returns the actions of the person at the browser."""
 
     def __init__(self, host: str, port: int, *, count: int | None = None):
         """Start the server of the page.
@@ -23,7 +23,7 @@ class Page(Site):
             count: Number of trajectories that the page shows as the goal. None: no goal.
 
         Raises:
-            OSError: The address cannot be used. The message names it and the remedy.
+            OSError: The address cannot be used. The message names the address and the remedy.
         """
         self._count = count
         self._view: View | None = None
@@ -37,7 +37,7 @@ class Page(Site):
             self._changed.notify_all()
 
     def action(self) -> Action | None:
-        """The action of the button that was pressed last, or None if there is no new one."""
+        """The action of the button that was pressed last, or None if no button was pressed since the last call."""
         with self._changed:
             action, self._action = self._action, None
             return action
@@ -49,8 +49,8 @@ class Page(Site):
             content: Decoded JSON with `action`, and with the `stage` and the `number` of the trajectory on the page.
 
         Returns:
-            False if the content is invalid, or if the page showed an old stage or trajectory. The action `stop` is
-            accepted in every stage.
+            True if the action is accepted, or False if the content is invalid or the page showed an old stage or
+            trajectory. The action `stop` is accepted even from a page with an old stage or trajectory.
         """
         with self._changed:
             view = self._view
@@ -91,13 +91,13 @@ class Page(Site):
         }
 
     def image(self, stream: str) -> Image | None:
-        """The newest image of a stream, or None before the first pair."""
+        """The newest image of a stream (`visual` or `tactile`), or None before the first pair of images."""
         with self._changed:
             pair = None if self._view is None else self._view.pair
         return None if pair is None else getattr(pair, stream).image
 
     def still(self, path: str) -> Image | None:
-        """An image of the current trajectory by its path, such as `end/initial/visual.jpg`, or None."""
+        """The image of the current trajectory at a path such as `end/initial/visual.jpg`, or None without an image."""
         head, _, rest = path.partition("/")
         end, _, name = rest.partition("/")
         stream = name.removesuffix(".jpg")

@@ -43,7 +43,7 @@ class Config:
 
 
 class Recorded(NamedTuple):
-    """Recorded trajectories and images of the empty pad, all in the view of the sensor."""
+    """Recorded trajectories and images of the empty pad. All images are rectified to the view of `Sensor.camera`."""
 
     train: hardware.RecordedImages  # training trajectories
     validation: hardware.RecordedImages  # validation trajectories
@@ -74,7 +74,7 @@ def check(config: Config) -> None:
 
 
 def read(config: Config, workdir: Path) -> Recorded:
-    """Read the confirmed trajectories of a work directory, rectify their images, and split them for validation.
+    """Read the confirmed trajectories of a work directory, rectify the images, and hold out validation trajectories.
 
     Args:
         config: Configuration of the experiment.
@@ -82,7 +82,8 @@ def read(config: Config, workdir: Path) -> Recorded:
 
     Raises:
         FileNotFoundError: There is no session, or no sensor file.
-        ValueError: There are too few trajectories, the sensor file has no backgrounds, or it does not fit the images.
+        ValueError: There are too few trajectories, or the sensor file names no background images (images of the empty
+            pad), or the sensor file does not fit the images.
         OSError: A file is damaged.
     """
     recordings = hardware.load_recordings(workdir / "dataset")
@@ -115,12 +116,15 @@ def read(config: Config, workdir: Path) -> Recorded:
 
 
 def is_twin(recordings: hardware.Recordings) -> bool:
-    """Return whether a digital twin made the trajectories. Serial numbers of its LED controller begin with TWIN."""
+    """Return whether a digital twin made the trajectories.
+
+    The serial number of a twin's LED controller begins with TWIN.
+    """
     return str(recordings.session["leds"]).startswith("TWIN")
 
 
 def missing(config: Config, workdir: Path) -> int:
-    """The number of trajectories that this command still has to collect with its own digital twin.
+    """The number of trajectories that `experiments.real train` still has to collect with its own digital twin.
 
     The number is 0 if the trajectories in the work directory come from a device, or from a twin that
     `python -m experiments.twin` ran as a separate program.
@@ -143,7 +147,8 @@ def sensor_file(workdir: Path) -> tuple[hardware.Device, sts.Sensor]:
     """Read the sensor file of a work directory.
 
     Returns:
-        The device, with the lens and the names of its backgrounds, and the constants of the sensor.
+        The description of the device, with the lens and the names of the background images, and the constants of the
+        sensor.
 
     Raises:
         FileNotFoundError: There is no sensor file.
@@ -165,7 +170,10 @@ def sensor_file(workdir: Path) -> tuple[hardware.Device, sts.Sensor]:
 
 
 def identity(workdir: Path, recordings: hardware.Recordings) -> str:
-    """The checksum of the trajectories and the sensor file, which contains the checksums of its backgrounds."""
+    """The checksum of the trajectories and the sensor file.
+
+    The sensor file contains the checksums of the background images.
+    """
     return _files.digest({"dataset": recordings.identity, "sensor": _files.sha256(workdir / "sensor.json")})
 
 
@@ -194,7 +202,7 @@ def jobs(config: Config, data: Recorded) -> Iterator[stages.Job]:
 
 
 def augmented(config: Config, images: np.ndarray, empty: np.ndarray) -> np.ndarray:
-    """Add shifted copies of the image pairs of a stream, and copies of the pairs with the final image in both places.
+    """Add shifted copies of a stream's image pairs, and copies in which the final image replaces the initial image.
 
     Args:
         config: Configuration of the experiment.

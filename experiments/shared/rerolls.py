@@ -1,4 +1,7 @@
-"""Simulates held-out starts again with newly drawn hidden properties (re-rolls), and stores their scores."""
+"""Simulates re-rolls of held-out trajectories, and stores the scores of the re-rolls.
+
+A re-roll is a new simulation from the first pose of a trajectory, with newly drawn hidden properties.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -19,7 +22,7 @@ FORMAT = 2  # version of the files (2: outcomes are decided by the ratio of prob
 
 
 class Ceilings(NamedTuple):
-    """Re-rolls of the first held-out starts, and their scores as predictions."""
+    """Re-rolls (new simulations) of the first held-out trajectories, and the scores of the re-rolls as predictions."""
 
     scores: dict[str, evaluation.Scores]  # scores of the mean of the re-rolls, and of a single re-roll
     pose: np.ndarray  # poses at rest, shape (times, n, 7)
@@ -38,21 +41,22 @@ def ceilings(
     num: int,
     judge: Judge,
 ) -> Ceilings:
-    """Read the re-rolls of the first `num` held-out trajectories, or compute and write them.
+    """Read the re-rolls of the first `num` held-out trajectories, or compute and write the re-rolls.
 
-    The re-rolls are in `ceiling{suffix}.npz`. `ceiling{suffix}.json` records the checksums of the inputs from which
-    they were computed. If an input has changed, the re-rolls are computed again.
+    A re-roll is a new simulation from the first pose of a trajectory, with newly drawn hidden properties. The re-rolls
+    are in `ceiling{suffix}.npz`. `ceiling{suffix}.json` records the checksums of the inputs of the computation. If an
+    input has changed, the re-rolls are computed again.
 
     Args:
         workdir: Work directory.
         suffix: Suffix in the names of the files, which distinguishes several splits.
         collection: Collection of the experiment.
-        sensor: Sensor that renders the re-rolls at rest.
+        sensor: Sensor that renders the last frames of the re-rolls.
         data: Dataset of the experiment.
         test: Held-out trajectories.
         times: Number of re-rolls of each trajectory.
         num: Number of trajectories with re-rolls.
-        judge: Function that scores a prediction of these trajectories (`evaluation.scorer`).
+        judge: Function that scores a prediction of the first `num` held-out trajectories (`evaluation.scorer`).
     """
     few = dataset.Pairs(*(leaf[:num] for leaf in test))
     record, path = workdir / f"ceiling{suffix}.json", workdir / f"ceiling{suffix}.npz"
@@ -83,12 +87,14 @@ def reroll(
 ) -> Ceilings:
     """Re-roll trajectories, and score the mean of the re-rolls and a single re-roll as predictions.
 
+    A re-roll is a new simulation from the first pose of a trajectory, with newly drawn hidden properties.
+
     Args:
         collection: Collection of the experiment.
-        sensor: Sensor that renders the re-rolls at rest.
+        sensor: Sensor that renders the last frames of the re-rolls.
         test: Trajectories to re-roll.
         times: Number of re-rolls of each trajectory.
-        judge: Function that scores a prediction of these trajectories.
+        judge: Function that scores a prediction of the trajectories in `test`.
         progress: Function that receives the number of simulated re-rolls.
     """
     mean = evaluation.ceiling(collection, sensor, test, times, jax.random.key(SEED), progress=progress)

@@ -16,12 +16,12 @@ def identity(folder: Path) -> str:
 def write(path: Path, content: Mapping[str, Any], inputs: Mapping[str, str], outputs: Sequence[Path]) -> None:
     """Write results as JSON, with the checksums of their inputs and of further output files.
 
-    Write this file after all others, because it marks the results as complete.
+    Call this function after all other files have been written, because the JSON file marks the results as complete.
 
     Args:
         path: Path of the JSON file.
         content: Results.
-        inputs: Checksum of each input, by the name that messages show.
+        inputs: Checksum of each input. The keys are the names of the inputs in messages.
         outputs: Further output files, in the folder of `path` or below it.
     """
     record = {
@@ -37,7 +37,7 @@ def stale(path: Path, inputs: Mapping[str, str]) -> str | None:
 
     Args:
         path: Path of the JSON file that `write` has written.
-        inputs: Present checksum of each input.
+        inputs: Current checksum of each input.
 
     Returns:
         The reason for a new computation, or None if the results are up to date.

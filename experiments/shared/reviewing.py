@@ -1,4 +1,7 @@
-"""`review` of `experiments.real`: list, confirm, discard, check and draw the trajectories of a work directory."""
+"""`review` of `experiments.real`: list, confirm, discard and check trajectories, and draw images of trajectories.
+
+The trajectories are in a work directory.
+"""
 
 import dataclasses
 from pathlib import Path
@@ -33,11 +36,11 @@ class Review:
 
 
 def review(config: Review) -> None:
-    """Apply the changes, then check the files, draw the images, or list the trajectories.
+    """Restore, confirm and discard trajectories, then check the files, draw the images, or list the trajectories.
 
     Raises:
         SystemExit: `check` is True, and a file is damaged.
-        ValueError: A trajectory cannot be drawn, or the suffix of `sheet` is not that of a picture.
+        ValueError: A trajectory cannot be drawn, or `sheet` does not have the suffix of a picture file.
         OSError: A trajectory does not exist, or a file cannot be read or written.
     """
     folder = config.workdir / "dataset"

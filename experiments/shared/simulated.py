@@ -58,7 +58,10 @@ class Hand(twin.Hand):
         self._problem: str | None = None
 
     def show(self, view: View) -> None:
-        """Follow the instruction of a view, and show the number of confirmed trajectories, or a problem."""
+        """Follow the instruction from `hardware.collect` in `view`.
+
+        The number of confirmed trajectories is shown, and the message of a new problem.
+        """
         super().show(view)
         self._bar("collect", view.confirmed, self._count)
         if view.problem is not None:
@@ -69,9 +72,10 @@ class Hand(twin.Hand):
 
 
 def collect(config: Simulated) -> None:
-    """Collect until there are enough trajectories, or continue an interrupted collection.
+    """Collect until there are `config.count` confirmed trajectories. An interrupted collection is continued.
 
-    Trajectory n of the session is trajectory n of `ObjectScene`, so a continued collection repeats no trajectory.
+    The scene of the twin (`ObjectScene`) numbers the simulated trajectories, and the session numbers the recorded
+    trajectories. Both numbers of a trajectory are equal. Therefore, a continued collection repeats no trajectory.
 
     Raises:
         ValueError: The work directory contains data of another sensor or with other options.

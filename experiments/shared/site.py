@@ -42,7 +42,7 @@ class Site(abc.ABC):
             streams: Names of the live images. The page loads each from `NAME.mjpg`.
 
         Raises:
-            OSError: The address cannot be used. The message names it and the remedy.
+            OSError: The address cannot be used. The message names the address and the remedy.
         """
         self.document, self.streams = document, streams
         self._changed = threading.Condition()
@@ -106,12 +106,16 @@ class Site(abc.ABC):
         return time.monotonic() - self._asked_s < _OPEN_S
 
     def asked(self) -> dict[str, Any]:
-        """Record the time of a request for the facts, and return the facts."""
+        """Return the facts (the content of the page besides images), and record the time of this request."""
         self._asked_s = time.monotonic()
         return self.facts()
 
     def wait(self, last: int) -> int | None:
-        """Wait until the number of changes exceeds `last`. Returns this number, or None if the program has ended."""
+        """Wait until the content of the page has changed more than `last` times, or the program has ended.
+
+        Returns:
+            The number of changes so far, or None if the program has ended.
+        """
         with self._changed:
             self._changed.wait_for(lambda: self._ended or self._number > last)
             return None if self._ended else self._number
@@ -137,7 +141,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         """Do not log requests."""
 
     def do_GET(self) -> None:
-        """Send the page, the facts, an image or a stream."""
+        """Send the HTML page, the content of the page from `Site.facts`, a single image or a stream."""
         path = self.path.partition("?")[0].removeprefix("/")
         with contextlib.suppress(OSError):  # the browser may have closed the connection
             if not self._own_name():

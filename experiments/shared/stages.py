@@ -55,7 +55,7 @@ def claim(config: Config, workdir: Path) -> None:
 
 
 def collect(config: Config, workdir: Path, sensor: sts.Sensor) -> dataset.Dataset:
-    """Simulate and render the parts of the dataset that are missing, and open it.
+    """Simulate and render the missing parts of the dataset, and open the dataset.
 
     Objects that cannot be simulated are listed in `objects.txt` in the work directory.
     """
@@ -97,7 +97,7 @@ def _check_trained(config: Config, workdir: Path, split: str) -> None:
 
 
 def note(path: Path, lines: Sequence[str]) -> None:
-    """Append lines to a text file, except those that it contains already."""
+    """Append lines to a text file, except lines that the file contains already."""
     there = path.read_text(errors="replace") if path.exists() else ""
     new = "".join(f"{line}\n" for line in lines if f"{line}\n" not in there)
     if new:
@@ -129,7 +129,8 @@ def jobs(
         sensor: Sensor of the collection.
         pairs: First and last frames of the training trajectories, with images as they were collected.
         views: Further images of the training objects. Only the state-space model uses them.
-        falls: Trajectories of the training objects without images. Only the state-space model uses them.
+        falls: First and last poses in trajectories of the training objects, without images. Only the state-space model
+            uses these poses.
     """
     preprocessing, scenario = preprocessing_of(config), config.collection.scenario
     frame = dataset.empty_frame(sensor, config.collection)
@@ -219,7 +220,7 @@ def calibrate(job: Job, model: statespace.Config, folder: Path, config: Config, 
 
 
 def preprocessing_of(config: Config) -> training.Preprocessing:
-    """The preprocessing of the inputs that the configuration of an experiment determines."""
+    """Make the preprocessing of the inputs from the configuration of an experiment."""
     collection = config.collection
     small = (config.image_size, config.image_size)
     return training.Preprocessing(

@@ -65,7 +65,7 @@ def predictions(models: Mapping[str, Path], data: Recorded) -> dict[str, Predict
     """Predict the validation trajectories with each model, from each subset of its inputs.
 
     Returns:
-        Predictions by the title of the row in the table.
+        The predictions. The keys are the titles of the rows in the table.
     """
     found = {}
     first = {stream: getattr(data.validation, stream)[:, 0].astype(np.float32) / 255 for stream in evaluation.STREAMS}

@@ -39,7 +39,7 @@ class Train:
 def learn(args: Train) -> None:
     """Collect trajectories of the twin if there are too few, train, evaluate, and print the table.
 
-    Trajectories of a device are used as they are.
+    If the trajectories in the work directory come from a device, no further trajectories are collected.
 
     Raises:
         ValueError: An option is out of range, or the results were made with other options or trajectories.
@@ -72,7 +72,10 @@ def learn(args: Train) -> None:
 
 
 def collect(config: Config, workdir: Path) -> None:
-    """Collect the missing trajectories of the twin. With trajectories of a device, nothing is collected."""
+    """Collect the missing trajectories of the twin.
+
+    If the trajectories in the work directory come from a device, no trajectories are collected.
+    """
     count = recorded.missing(config, workdir)
     if not count:
         return
@@ -88,7 +91,7 @@ def plan(config: Config, missing: int) -> str:
         missing: Number of trajectories that the twin has to collect.
 
     Returns:
-        A text with one line for each stage, and a line for their sum.
+        A text with one line for each stage, and a line for the total duration.
     """
     with tempfile.TemporaryDirectory() as name:
         workdir, clock = Path(name), [time.perf_counter()]

@@ -13,7 +13,7 @@ KEYS = {"\n": Action.CONFIRM, "\r": Action.CONFIRM, "d": Action.DISCARD, "q": Ac
 
 
 class Terminal:
-    """Shows views to a person at a terminal, and returns the person's actions (a `hardware.Person`).
+    """Implements `hardware.Person` with a terminal: shows views to a person, and returns the person's actions.
 
     Enter confirms, d discards and q stops. If the standard input is not a terminal, each line acts like a key: an empty
     line confirms, `d` discards and `q` stops. The end of the input has the same effect as `q`.
@@ -33,7 +33,10 @@ class Terminal:
             say("Enter confirms, d discards, q stops")
 
     def show(self, view: View) -> None:
-        """Print the instruction or the problem of a view if it has changed."""
+        """Print the instruction or the problem of a view.
+
+        Nothing is printed if the instruction, the problem and the number of the trajectory are unchanged.
+        """
         self._stages = self._stages[1], view.stage
         shown = view.instruction, view.problem, view.number
         if shown != self._shown:
@@ -45,7 +48,7 @@ class Terminal:
         """The action of the next key, or None.
 
         Unknown keys are ignored. Enter and d are also ignored if they were pressed before the person saw the current
-        stage.
+        stage of the recording (`hardware.Stage`).
         """
         while select.select([sys.stdin], [], [], 0)[0]:
             data = os.read(sys.stdin.fileno(), 1)

@@ -16,10 +16,11 @@ PARTS = ("train", "validation", "test")  # the parts into which the objects are 
 
 @dataclasses.dataclass(frozen=True)
 class Collection:
-    """Description of a dataset. A collection and a `Sensor` determine every byte of the dataset.
+    """Description of a dataset.
 
-    The description contains the names of the scenario and of the object classes, but not their code. If you change the
-    code of your own scenario or object class, the same collection therefore gives another dataset.
+    A collection and a `Sensor` determine every byte of the dataset, as long as the code of the scenario and of the
+    object classes stays the same. The description contains the names of the scenario and of the object classes, but not
+    their code. If you change the code of your own scenario or object class, the same collection gives another dataset.
     """
 
     scenario: physics.Scenario = dataclasses.field(default_factory=physics.Freefall)

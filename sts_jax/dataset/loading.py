@@ -287,7 +287,7 @@ class Dataset:
         Args:
             trajectories: Indices of the trajectories, int `(n,)`.
             symmetries: True to add the turned and mirrored copies of the frames. The dataset contains copies if its
-                collection has `symmetries=True`. Each trajectory is directly followed by its copies.
+                collection has `symmetries=True`. In the result, each trajectory is directly followed by its copies.
 
         Raises:
             ValueError: An index is not a whole number or is out of range, or its trajectory has no images.
@@ -338,10 +338,10 @@ def load(folder: str | Path) -> Dataset:
         folder: The folder that `collect` has written.
 
     Raises:
-        FileNotFoundError: The folder or one of its files is missing, or the collection is not finished. The message
-            names the file.
+        FileNotFoundError: The folder or one of its files is missing, or `collect` has not finished the dataset. The
+            message names the file.
         NotADirectoryError: `folder` is a file.
-        DamagedFileError: A file is damaged, or belongs to another dataset or shard. The message names it.
+        DamagedFileError: A file is damaged, or belongs to another dataset or shard. The message names the file.
         ValueError: Another version of the library wrote the dataset in another format.
     """
     folder = Path(folder)

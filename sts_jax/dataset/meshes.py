@@ -95,7 +95,7 @@ def survey_meshes(
     if not usable:
         raise ValueError(
             f"{folder} has no object that can be used in {type(scenario).__name__}. Give another folder, or repair the "
-            f"files. The reasons are:\n{listing}"
+            f"files. The objects were left out for these reasons:\n{listing}"
         )
     names, labels = tuple(item.name for item in usable), tuple(item.label for item in usable)
     kept = None if cache is None else str(cache)

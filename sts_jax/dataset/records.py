@@ -1,12 +1,13 @@
 """Shards on disk. A file is written as a whole or not at all, and the same inputs give the same bytes.
 
-A shard is two files. `NAME.array_record` has one record per rendered frame: the visual image, the tactile image
-(`uint8`, `(height, width, 3)`) and the segmentation (bits), in that order. The frames are followed by one record per
-view. A view is a visual image of an object in an initial pose, without a trajectory.
+A shard is a pair of files with the data of some objects. `NAME.array_record` has one record per rendered frame: the
+visual image, the tactile image (`uint8`, `(height, width, 3)`) and the segmentation (bits), in that order. The frames
+are followed by one record per view. A view is a visual image of an object in an initial pose from which no trajectory
+is simulated.
 
-`NAME.npz` contains all other data as named arrays. It is written last, and a shard without it counts as missing. It
-also contains the `Identity` of the shard and the SHA-256 of `NAME.array_record`. A reader therefore notices if one of
-the two files comes from another shard or dataset.
+`NAME.npz` contains the `Identity` of the shard, the SHA-256 of `NAME.array_record`, and all other data as named arrays.
+The identity and the SHA-256 show a reader whether one of the two files comes from another shard or dataset. `NAME.npz`
+is written last, and a shard without `NAME.npz` counts as missing.
 """
 
 import io
@@ -68,17 +69,17 @@ def check_format(content: Any, folder: Path) -> None:
         folder: The folder of the dataset, for messages.
 
     Raises:
-        DamagedFileError: The content is not the description of a collection.
-        ValueError: The dataset was written by an older or newer version.
+        DamagedFileError: The content does not describe a dataset.
+        ValueError: The dataset was written by an older or newer version of the library.
     """
     if not isinstance(content, dict):
         raise DamagedFileError(
-            f"{folder / 'collection.json'} does not describe a collection: delete {folder} and collect again."
+            f"{folder / 'collection.json'} does not describe a dataset: delete {folder} and collect the dataset again."
         )
     written = content.get("format", 1)  # the first format had no number
     if written != FORMAT:
         raise ValueError(
-            f"{folder} is a dataset of format {written!r}, and this version reads format {FORMAT}: "
+            f"{folder} is a dataset of format {written!r}, but this version of sts_jax reads format {FORMAT}: "
             f"delete {folder} and collect again, or choose another folder."
         )
 
@@ -92,8 +93,8 @@ def write_shard(
         path: The `.array_record` file. The `.npz` file has the same path except for the suffix.
         frames: Batches of images in the order in which they are stored. The batches of frames come first, and each of
             them is a tuple `Images`. The batches of views come last, and each of them is a tuple with one array of n
-            visual images, uint8 `(n, height, width, 3)`. A view is a visual image of an object in an initial pose,
-            without a trajectory.
+            visual images, uint8 `(n, height, width, 3)`. A view is a visual image of an object in an initial pose from
+            which no trajectory is simulated.
         arrays: All other data, one array for each name in `records.ARRAYS`.
         identity: The identity of the shard, which `read_shard` checks.
 
@@ -116,8 +117,8 @@ def read_shard(path: Path, identity: Identity) -> dict[str, np.ndarray]:
         The arrays given to `write_shard`.
 
     Raises:
-        FileNotFoundError: A file is missing. The message names it.
-        DamagedFileError: A file is damaged, or belongs to another shard or dataset. The message names it.
+        FileNotFoundError: A file is missing. The message names the file.
+        DamagedFileError: A file is damaged, or belongs to another shard or dataset. The message names the file.
     """
     small = path.with_suffix(".npz")
     arrays = read_arrays(small)
@@ -224,7 +225,8 @@ def read_images(path: Path, indices: np.ndarray, *, resolution: tuple[int, int],
         path: The `.array_record` file.
         indices: Indices of the frames in the file, int `(n,)`.
         resolution: Height and width of every image (pixels).
-        total: Number of records (frames and views) that the file must contain.
+        total: Number of records (frames and views) that the file must contain. A view is a visual image of an object in
+            an initial pose from which no trajectory is simulated.
 
     Returns:
         The images of the n frames, in the given order.
@@ -246,7 +248,9 @@ def read_images(path: Path, indices: np.ndarray, *, resolution: tuple[int, int],
 
 
 def read_views(path: Path, indices: np.ndarray, *, resolution: tuple[int, int], total: int) -> np.ndarray:
-    """Read some views of a shard. A view is a visual image of an object in an initial pose, without a trajectory.
+    """Read some views of a shard.
+
+    A view is a visual image of an object in an initial pose from which no trajectory is simulated.
 
     Args:
         path: The `.array_record` file.

@@ -43,7 +43,7 @@ def render(
     """Render the images of a shard in batches, on all CPU cores.
 
     A shard contains frames of simulated trajectories, followed by views. A view is a visual image of an object in an
-    initial pose, without a trajectory.
+    initial pose from which no trajectory is simulated.
 
     Args:
         collection: The description of the dataset.
@@ -118,7 +118,7 @@ def render_uint8(
         pose: Poses of the object (its mesh frame) in the sensor frame: position (m) and quaternion (w, x, y, z).
         wrench: Wrenches of the pad on the object: force (N) and moment about the sensor's origin (N m).
         resolution: Height h and width w of the images (pixels).
-        crop: True to show only the square around the object. False to show the whole pad.
+        crop: True to show only a window around the object. False to show the whole pad.
 
     Returns:
         The visual images, the tactile images, and the segmentation, bool `(n, h, w)`, which is true in pixels that show

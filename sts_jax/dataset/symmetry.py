@@ -1,7 +1,9 @@
-"""Symmetries of the pad: mirror images and quarter turns of poses, wrenches and conditions.
+"""Symmetries of the pad: reflections and quarter turns of poses, wrenches and conditions.
 
-Symmetry s first mirrors (y becomes -y) if s >= 4, and then rotates about the z axis by `90 * (s % 4)` degrees.
-Symmetry 0 is the identity.
+Symmetry s is a rotation about the z axis by `90 * (s % 4)` degrees. If s >= 4, a reflection (y becomes -y) precedes the
+rotation. Symmetry 0 is the identity.
+
+A condition is the input that a scenario applies to a trajectory, such as an acceleration of the pad.
 """
 
 import math
@@ -15,12 +17,13 @@ from sts_jax import geometry
 def turn(pose: Float[Array, "*n 7"], symmetry: int) -> Float[Array, "*n 7"]:
     """Rotate or mirror poses by a symmetry of the pad.
 
-    Symmetries 4 to 7 mirror the object. The result is then the pose of the mirrored body, `objects.mirror(body)`.
+    Symmetries 4 to 7 mirror the object. The results of these symmetries are poses of the mirrored body,
+    `objects.mirror(body)`.
 
     Args:
         pose: Pose of the object (its mesh frame) in the sensor frame: position (m) and quaternion (w, x, y, z).
-        symmetry: Number of the symmetry, 0 to 7. Symmetry s first mirrors (y becomes -y) if s >= 4, and then rotates
-            about the z axis by `90 * (s % 4)` degrees. Symmetry 0 is the identity.
+        symmetry: Number of the symmetry, 0 to 7. Symmetry s is a rotation about the z axis by `90 * (s % 4)` degrees.
+            If s >= 4, a reflection (y becomes -y) precedes the rotation. Symmetry 0 is the identity.
     """
     if symmetry >= 4:
         pose = pose * jnp.array([1.0, -1, 1, 1, -1, 1, -1])
@@ -35,8 +38,8 @@ def turn_wrench(wrench: Float[Array, "*n 6"], symmetry: int) -> Float[Array, "*n
 
     Args:
         wrench: Force (N) and moment about the sensor's origin (N m).
-        symmetry: Number of the symmetry, 0 to 7. Symmetry s first mirrors (y becomes -y) if s >= 4, and then rotates
-            about the z axis by `90 * (s % 4)` degrees. Symmetry 0 is the identity.
+        symmetry: Number of the symmetry, 0 to 7. Symmetry s is a rotation about the z axis by `90 * (s % 4)` degrees.
+            If s >= 4, a reflection (y becomes -y) precedes the rotation. Symmetry 0 is the identity.
     """
     if symmetry >= 4:
         wrench = wrench * jnp.array([1.0, -1, 1, -1, 1, -1])
@@ -51,10 +54,10 @@ def turn_condition(condition: Float[Array, "*n c"], symmetry: int, vectors: int 
     A condition is the input that a scenario applies to a trajectory, such as an acceleration of the pad.
 
     Args:
-        condition: The numbers of each condition. Vectors (x, y) in the plane of the pad come first. They are followed
-            by scalars, which do not change.
-        symmetry: Number of the symmetry, 0 to 7. Symmetry s first mirrors (y becomes -y) if s >= 4, and then rotates
-            about the z axis by `90 * (s % 4)` degrees. Symmetry 0 is the identity.
+        condition: The c components of each condition. Vectors (x, y) in the plane of the pad come first, and scalars
+            follow. The symmetries do not change the scalars.
+        symmetry: Number of the symmetry, 0 to 7. Symmetry s is a rotation about the z axis by `90 * (s % 4)` degrees.
+            If s >= 4, a reflection (y becomes -y) precedes the rotation. Symmetry 0 is the identity.
         vectors: Number of vectors at the beginning of the condition.
     """
     if condition.shape[-1] == 0:

@@ -3,8 +3,8 @@
 The distances compare a set of real images with a set of simulated images. Images are uint8 `(n, height, width, 3)` of
 one stream. Each image has a group number, which is the number of its trajectory.
 
-The two sets are matched if both contain the same groups. Image i of one set and image i of the other then show the same
-object in the same pose. Sets that are not matched must have no group in common.
+The two sets are matched if both contain the same groups. In matched sets, image i of the real set and image i of the
+simulated set must show the same object in the same pose. Sets that are not matched must have no group in common.
 """
 
 from typing import NamedTuple
@@ -129,9 +129,9 @@ def energy_distance(
     far apart. Each feature is first divided by its standard deviation over both sets. If this deviation is below one
     grey level (1/255), the feature is divided by one grey level instead.
 
-    The three means use only pairs of images from different trajectories. The number of images therefore causes no
-    bias. Trajectories that occur in both sets also cause no bias. For equal distributions, the estimate varies around
-    0 and may be negative.
+    The three means use only pairs of images from different trajectories. An image is therefore never paired with
+    itself, so the estimate has no bias that depends on the number of images. Trajectories that occur in both sets also
+    cause no bias. For equal distributions, the estimate varies around 0 and may be negative.
 
     The p-value comes from a permutation test. If both sets have the same trajectories, a permutation exchanges the real
     and the simulated images of randomly selected trajectories. If they have no common trajectory, a permutation
@@ -181,11 +181,12 @@ def told_apart(
 ) -> Estimate:
     """Compute the cross-validated accuracy of a classifier that distinguishes real from simulated images.
 
-    The classifier is a logistic regression on standardised features. The accuracy is averaged over five
+    The classifier is a logistic regression on standardised features. The classifier is tested in five
     cross-validations of five folds. All real and simulated images of a trajectory are in the same fold. The classifier
     is therefore never tested on a trajectory to which it was fitted.
 
-    The accuracy is the mean of the accuracies for real and for simulated images, so 0.5 is chance. The 95 %
+    The share of correctly classified images is computed for the real and for the simulated images, and each share is
+    averaged over the five cross-validations. The accuracy is the mean of these two shares, so 0.5 is chance. The 95 %
     interval of the accuracy comes from a bootstrap, which draws tested trajectories with replacement. The bootstrap
     does not fit the classifier again, so the interval does not include the variation between training sets.
 
@@ -297,9 +298,9 @@ def _matched(
     if set(common) != set(np.r_[real_group, simulated_group]) or len(real) != len(simulated):
         raise ValueError(
             f"real_group ({len(real)} images) and simulated_group ({len(simulated)} images) have {len(common)} "
-            "trajectories in common. The two groups must have either no common trajectory, or the same trajectories "
-            "and equally many images: keep only the common trajectories, or give the simulated images other trajectory "
-            "numbers"
+            "trajectories in common. The real and the simulated images must either have no trajectory in common, or "
+            "have the same trajectories and be equally many: keep only the common trajectories, or give the simulated "
+            "images other trajectory numbers"
         )
     return True
 

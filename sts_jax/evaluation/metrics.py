@@ -1,6 +1,7 @@
 """Metrics of predictions for n items. An item is one held-out trajectory.
 
-Errors are arrays with one number per item. Means over items accept weights of the items, which the bootstrap varies.
+Errors are arrays with one number per item. Functions that average over items accept weights of the items. The
+bootstrap varies these weights.
 
 Predicted images are probabilities p, and the true images (targets) are grey values x, both in [0, 1]. The binary
 cross-entropy of a value is `BCE(x, p) = -x log p - (1 - x) log(1 - p)`. Its minimum is the entropy H(x) of the target:
@@ -77,7 +78,9 @@ def skill(error: ImageError, constant: ImageError, weight: np.ndarray | None = N
 
 
 def mean_per_pixel(values: np.ndarray, count: np.ndarray, weight: np.ndarray | None = None) -> float:
-    """Add up the errors of all items (predicted images), and divide the sum by the total number of pixels in all items.
+    """Compute the mean error per pixel and channel over all items (predicted images).
+
+    The mean is the weighted sum of `values` divided by the weighted sum of `count`.
 
     Args:
         values: Errors of the items, `(n,)`. The error of an item is a sum over the pixels of this item.
@@ -85,7 +88,7 @@ def mean_per_pixel(values: np.ndarray, count: np.ndarray, weight: np.ndarray | N
         weight: Weights of the items, `(n,)` (default: 1).
 
     Returns:
-        The mean error per pixel, or NaN if the weighted number of pixels is 0.
+        The mean error per pixel and channel, or NaN if the weighted sum of `count` is 0.
     """
     w = np.ones(len(values)) if weight is None else weight
     total = float((w * count).sum())
@@ -193,10 +196,11 @@ def energy_score(samples: np.ndarray, target: np.ndarray) -> np.ndarray:
 def coverage(samples: np.ndarray, target: np.ndarray, level: float = LEVEL) -> np.ndarray:
     """Determine whether true positions lie in the central region of their samples.
 
-    The mean of the results over all items is the coverage. If the predictor is calibrated, the expected coverage is
-    `level`, for every number of samples and every distribution.
+    The result for each item is a number from 0 (outside) to 1 (inside). The coverage is the mean of the results over
+    all items. If the predictor is calibrated, the expected coverage is `level`, for every number of samples and every
+    distribution.
 
-    The result of an item depends on the rank of its true position. The true position and its k samples are k + 1
+    The result for an item depends on the rank of its true position. The true position and its k samples are k + 1
     points. They are sorted by their mean distance from the other points, and the most central point has rank 1. If the
     predictor is calibrated, the true position has the distribution of the samples. Each rank r from 1 to k + 1 then has
     the same probability.
@@ -210,7 +214,7 @@ def coverage(samples: np.ndarray, target: np.ndarray, level: float = LEVEL) -> n
         level: Probability of the central region (default: 0.9).
 
     Returns:
-        Numbers from 0 (outside) to 1 (inside), `(n,)`.
+        Results from 0 (outside) to 1 (inside), `(n,)`.
     """
     points = np.concatenate([target[None], samples]).astype(np.float64)
     outlying = np.linalg.norm(points[:, None] - points[None], axis=-1).sum(1)  # (k + 1, n)

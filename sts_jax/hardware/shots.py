@@ -1,4 +1,4 @@
-"""`Shot` and `Pair`: images with the times between which the lights did not change. The module also has two errors."""
+"""`Shot` and `Pair`: images, each with the start and the end of a time interval in which the lights did not change."""
 
 import dataclasses
 from typing import Literal

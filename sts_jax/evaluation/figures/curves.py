@@ -1,4 +1,7 @@
-"""Figures of training curves and of the skill over the amount of training. Each function writes one file."""
+"""Figures of training curves and of the skill of models over the amount of training.
+
+The skill is a score of the predicted images (see `metrics.skill`). Each function writes one file.
+"""
 
 import collections
 from collections.abc import Mapping, Sequence
@@ -26,8 +29,8 @@ class Trained(NamedTuple):
 def scaling(path: Path, points: Sequence[Trained], *, ceiling: float | None = None, title: str) -> None:
     """Draw the visual skill of trained models over the number of training trajectories and over the training time.
 
-    The skill measures the error of the predicted images. It is 1 for perfect images and 0 for the mean training image
-    (see `metrics.skill`).
+    The skill is a score of the predicted images. Perfect images have the skill 1, and the mean training image has the
+    skill 0 (see `metrics.skill`).
 
     In the left panel, a line connects models with the same name and number of gradient steps. In the right panel, a
     line connects models with the same name and number of training trajectories.
@@ -90,7 +93,11 @@ def training_curves(path: Path, logs: Mapping[str, Sequence[Mapping[str, float]]
     - `kl`: The KL divergence of the latent variables from their prior (only models of `sts_jax.mvae`).
     - `look`: The KL divergence of the appearance code from its prior (only models of `sts_jax.statespace`). This code
         is the latent for all visible properties other than pose, shape and mass.
-    - `visual`, `tactile`, `state`, `outcome` and `pose`: The errors or negative log likelihoods of these quantities.
+    - `visual` and `tactile`: The errors of the predicted images.
+    - `state`: The squared error of the estimated pose, shape and mass in the first frame (only models of
+        `sts_jax.statespace`).
+    - `outcome`: The negative log likelihood of the true outcome (only models of `sts_jax.statespace`).
+    - `pose`: The squared error (`sts_jax.mvae`) or negative log likelihood (`sts_jax.statespace`) of the final pose.
 
     Args:
         path: The PNG file to write.

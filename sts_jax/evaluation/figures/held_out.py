@@ -39,9 +39,9 @@ def predictions(
     Args:
         path: The PNG file to write.
         test: The held-out trajectories.
-        predicted: Predictions for all of these trajectories, or for the first ones. A stream that is not predicted has
-            no rows.
-        num: Largest number of trajectories to draw. They are the first ones of `predicted`.
+        predicted: Predictions for all trajectories of `test`, or for the first trajectories of `test`. A stream that is
+            not predicted has no rows.
+        num: Maximum number of trajectories in the figure. The figure shows the first trajectories of `predicted`.
         title: Title of the figure.
         scenario: The scenario of the trajectories. It determines the velocities for the arrows and the names for the
             outcomes. If `scenario` is None, the figure has no arrows, and the names are those of `physics.Outcome`.

@@ -108,7 +108,8 @@ def animation(
         visual: Images of the visual stream, in [0, 1], `(frames, height, width, 3)`.
         tactile: Images of the tactile stream, in [0, 1], `(frames, height, width, 3)`.
         wrench: Force (N) and moment about the sensor's origin (N m) in each frame, `(frames, 6)`.
-        gravity: Gravity minus the acceleration of the pad in each frame, sensor frame (m/s^2), `(frames, 3)`.
+        gravity: Gravity minus the acceleration of the pad (m/s^2) at each time of `time`, in the coordinates of the
+            sensor, `(frames, 3)`.
         title: Title above the images.
         outcome: Text above the images in the last frame, such as `fell off`.
         side: Side of each of the three images (pixels).

@@ -24,8 +24,9 @@ def side_by_side(
 ) -> None:
     """Draw real and simulated images of the visual and the tactile stream side by side.
 
-    If `matched` is True, the figure also shows a difference for each row and each stream. The difference is the real
-    minus the simulated image, averaged over the colour channels. Red pixels are brighter in the real image.
+    If `matched` is True, the figure also shows a difference image for each row and each stream. The difference image is
+    the real minus the simulated image, averaged over the colour channels. The difference image is red where the real
+    image is brighter than the simulated image.
 
     Args:
         path: The PNG file to write.
