@@ -146,7 +146,7 @@ def in_c(items: list[objects.Body], traj: physics.Trajectory, constants: physics
 
 
 def speed(num: int) -> None:
-    """Print steps per second of MJX and of C MuJoCo, for drops of one hull of 32 vertices and of eight objects."""
+    """Print steps per second of MJX and of C MuJoCo, for drops of a hull of 32 vertices, then of each of 8 objects."""
     compare_speed("one hull of 32 vertices", [rod()], 8 * num)
     compare_speed("eight objects, up to 64 vertices", bodies(objects.CATEGORIES, 8), num)
 

@@ -1,7 +1,7 @@
 """Skill of the state-space model for different numbers of training trajectories and of training steps.
 
     python -m benchmarks.scaling runs/freefall --out scaling.png  # a run of --preset default, about 20 minutes
-    python -m benchmarks.scaling runs/freefall --shares 1 --steps 2000 --seeds 1 2   # two more seeds show the spread
+    python -m benchmarks.scaling runs/freefall --shares 1 --steps 1900 --seeds 1 2   # two more seeds show the spread
 
 The command uses the dataset of a run, and trains models in the folder `scaling` of the run. Some models are trained on
 a share of the training objects (`--shares`), with the largest number of steps in `--steps`. The other models are

@@ -16,9 +16,9 @@ of the same faces and poses, in three ways:
 - `trimesh`: the Python interface `mesh.ray` of trimesh
 
 All calls are timed in one thread, and also in as many threads as there are cores. One call of `sense` uses little more
-than one core, so `dataset.collect` renders in threads too. On a GPU, `sense` renders a batch instead. The calls
-alternate, and the figures are medians. A ratio is embree's seconds divided by the seconds of `sense`, with the same
-number of threads.
+than one core, so `dataset.collect` runs several calls at once, in threads. On a GPU, one call of `sense` renders a
+batch instead. Calls of `sense` and of embree are timed alternately, and the figures are medians. A ratio is embree's
+seconds divided by the seconds of `sense`, with the same number of threads.
 
 A second table has the share of each stage in the time of `sense`. At 640x480 it also has the speed relative to the
 paper's code, whose renderer and shader we once measured at 0.40 s per frame on a CPU, without physics.

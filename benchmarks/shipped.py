@@ -3,11 +3,11 @@
     python -m benchmarks.shipped perturbed    # about 15 minutes on two CPU cores, 5 GB of memory
     python -m benchmarks.shipped perturbed --trained runs/perturbed/models/statespace    # another trained model
 
-An experiment has few held-out objects. The intervals of the outcome metrics are therefore wide in the experiment's
-table, where the outcome is what happens to an object, such as falling off. This command draws new objects from the
-distribution of the experiment, and simulates and renders four trajectories of each object. The command prints metrics
-of the shipped model, and the relative reduction of the outcome's log loss if the model sees the tactile image in
-addition to the visual image. It also draws 16 samples of each prediction, and prints metrics of the samples, such as
+The outcome of a trajectory is the event that happens to the object, such as falling off. An experiment has few held-out
+objects, so the intervals of the outcome metrics in the experiment's table are wide. This command draws new objects from
+the distribution of the experiment, and simulates and renders four trajectories of each object. The command prints
+metrics of the shipped model, and the relative reduction of the outcome's log loss if the model sees the tactile image
+in addition to the visual image. It also draws 16 samples of each prediction, and prints metrics of the samples, such as
 the sharpness.
 
 The calibration error of few trajectories is above 0 even if the probabilities are exact. The command therefore also

@@ -71,10 +71,11 @@ def sense(
     """Render the images that the sensor takes of one object.
 
     With a wrench, the object sinks and tilts until the gel balances Fz, Mx and My (`tactile.settle`), and the images
-    show the object in this balanced pose. Without a wrench, the object stays in the given pose. The images show an
-    empty sensor if no part of the object is above the plane of the gel's outer face (z > 0).
+    show the object in this balanced pose. Without a wrench, the object stays in the given pose. The gel's outer face
+    is the plane z = 0 of the sensor frame. If no part of the object is above this plane, the images show an empty
+    sensor.
 
-    The images also show an empty sensor, and `Frame.balanced` is False, in these cases:
+    In each of the following cases, the images also show an empty sensor, and `Frame.balanced` is False:
 
     - The pose or the wrench is not finite.
     - The squared length of the quaternion is zero or infinite in float32.
@@ -147,7 +148,8 @@ def expose(sensor: Sensor, frame: Frame, light: ScalarLike) -> Float[Array, "*n 
 
     V is the visual stream, T is the tactile stream, l is `light`, and k is the ratio of the exposure time of V to the
     exposure time of T (`Room.exposure`). The denominator is the ratio of the exposure time at level 0 to the exposure
-    time at level l. A pixel that is equally bright in both streams is therefore equally bright at every level.
+    time at level l. With V = T, the image equals V for every l. A pixel that is equally bright in both streams is
+    therefore equally bright at every level.
 
     Args:
         sensor: Sensor that made the frame.

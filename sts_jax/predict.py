@@ -28,8 +28,8 @@ class Predictor:
 
     `Predictor.load("freefall")` loads a model that comes with the library.
     `Predictor.load("runs/freefall/models/statespace")` loads a model that you trained. Calls are pure, and work inside
-    `jax.jit`, `jax.vmap` and `jax.grad`. On a CPU, predict large batches in one thread only: with JAX 0.10.1, two
-    simultaneous calls with 60 images each stopped forever.
+    `jax.jit`, `jax.vmap` and `jax.grad`. On a CPU, predict large batches in one thread only. With JAX 0.10.1, two
+    simultaneous calls, each with a batch of 60 images, never returned.
     """
 
     def __init__(

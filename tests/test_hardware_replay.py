@@ -297,7 +297,9 @@ def test_damaged_recordings_are_named(folder, tmp_path):
         DamagedFileError, r"tactile.mkv is truncated: it has [345] images, but .* lists 6.*remove the last [123] lines"
     )
     (folder / "tactile.mkv").unlink()
-    refused(FileNotFoundError, r"tactile.mkv cannot be read .*\. According to frames.jsonl, it contains 6 images")
+    refused(
+        FileNotFoundError, r"tactile.mkv cannot be read .*\. According to frames.jsonl, this video contains 6 images"
+    )
     changed = bytearray(video)
     changed[-100] ^= 1
     (folder / "tactile.mkv").write_bytes(changed)

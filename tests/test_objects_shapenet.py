@@ -76,7 +76,7 @@ def test_models_of_other_categories_and_defective_rows_are_skipped_with_a_reason
     assert listed.items[3].notes == ("metadata.csv has no front: ShapeNet's default is used",)
     reasons = dict(listed.skipped)
     for name, reason in (
-        ("h", "categories of several classes (fork, spoon)"),
+        ("h", "belong to several classes (fork, spoon)"),
         ("i", "has no unit"),
         ("j", "unit is 'inch'"),
         ("k", "must not be parallel"),

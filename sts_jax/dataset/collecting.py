@@ -4,10 +4,8 @@ A dataset consists of shards. A shard is a pair of files for some of the objects
 function of the `Collection`, the sensor and the index of the shard, so a missing shard can be made again at any time.
 """
 
-import concurrent.futures
-import contextlib
 import dataclasses
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -105,24 +103,16 @@ def _collect(
         folder / "split.json",
         {name: [int(i) for i in part] for name, part in split_objects(collection).items()},
     )
-    paths = [records.shard_path(folder, collection.num_shards, index) for index in range(collection.num_shards)]
-    missing = [index for index, path in enumerate(paths) if not path.with_suffix(".npz").exists()]
     made = Collected(0, ())
-    with contextlib.closing(_made_ahead(collection, [_members(collection, index) for index in missing])) as ahead:
-        for index, path in enumerate(paths):
-            identity = records.Identity(digest(description), digest(constants), index)
-            if index in missing:
-                _make_shard(collection, sensor, folder, identity, *next(ahead), progress)
-            shard = records.read_shard(path, identity)
-            resampled = made.resampled + int(shard["trajectory/resampled"].sum())
-            made = Collected(resampled, made.left_out + tuple(shard["left_out"].tolist()))
+    for index in range(collection.num_shards):
+        identity = records.Identity(digest(description), digest(constants), index)
+        path = records.shard_path(folder, collection.num_shards, index)
+        if not path.with_suffix(".npz").exists():
+            _make_shard(collection, sensor, folder, identity, progress)
+        shard = records.read_shard(path, identity)
+        resampled = made.resampled + int(shard["trajectory/resampled"].sum())
+        made = Collected(resampled, made.left_out + tuple(shard["left_out"].tolist()))
     return made
-
-
-def _members(collection: Collection, index: int) -> np.ndarray:
-    """Indices of the objects in a shard."""
-    first = index * collection.objects_per_shard
-    return np.arange(first, min(first + collection.objects_per_shard, collection.num_objects))
 
 
 def _make_shard(
@@ -130,13 +120,13 @@ def _make_shard(
     sensor: Sensor,
     folder: Path,
     identity: records.Identity,
-    found: dict[int, objects.Body],
-    left_out: list[str],
     progress: Callable[[Progress], None] | None,
 ) -> None:
-    """Simulate, render and write one shard. Its index is `identity.shard`, and `_made_ahead` made its objects."""
-    index, first = identity.shard, int(_members(collection, identity.shard)[0])
+    """Simulate, render and write one shard. Its index is `identity.shard`."""
+    index, first = identity.shard, identity.shard * collection.objects_per_shard
+    members = np.arange(first, min(first + collection.objects_per_shard, collection.num_objects))
     key = jax.random.fold_in(jax.random.key(collection.seed), collection.num_objects + index)
+    found, left_out = _made(collection, members)
     report = _report(progress, first * collection.num_per_object, collection.num_trajectories, "trajectories")
     found, trajectory, failed = _simulated(collection, sensor, key, found, report)
     left_out += failed
@@ -207,37 +197,15 @@ def _arrays(
     return arrays
 
 
-def _made_ahead(
-    collection: Collection, shards: Sequence[np.ndarray]
-) -> Generator[tuple[dict[int, objects.Body], list[str]], None, None]:
-    """Make the objects of some shards. One thread makes those of the next shard, while the caller uses a shard.
-
-    Args:
-        collection: The description of the dataset.
-        shards: Indices of the objects in each shard.
-
-    Yields:
-        The objects of a shard by index, and one line for each object that cannot be made (such as a deleted file).
-    """
-    pool = concurrent.futures.ThreadPoolExecutor(1)
-
-    def submitted(members: np.ndarray) -> dict[int, concurrent.futures.Future[list[objects.Body]]]:
-        return {number: pool.submit(make_bodies, collection, np.array([number])) for number in members.tolist()}
-
-    try:
-        following = submitted(shards[0]) if shards else {}
-        for number in range(len(shards)):
-            present, following = following, submitted(shards[number + 1]) if number + 1 < len(shards) else {}
-            bodies: dict[int, objects.Body] = {}
-            left_out: list[str] = []
-            for index, future in present.items():
-                try:
-                    (bodies[index],) = future.result()
-                except (OSError, ValueError) as error:
-                    left_out.append(f"{_named(collection, index)}: {error}")
-            yield bodies, left_out
-    finally:
-        pool.shutdown(cancel_futures=True)
+def _made(collection: Collection, members: np.ndarray) -> tuple[dict[int, objects.Body], list[str]]:
+    """Make objects. Return them by index, and one line for each that cannot be made (such as a deleted file)."""
+    bodies, left_out = {}, []
+    for number in members.tolist():
+        try:
+            (bodies[number],) = make_bodies(collection, np.array([number]))
+        except (OSError, ValueError) as error:
+            left_out.append(f"{_named(collection, number)}: {error}")
+    return bodies, left_out
 
 
 def _named(collection: Collection, number: int) -> str:

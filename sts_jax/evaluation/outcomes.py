@@ -102,6 +102,6 @@ def emptiness(visual: np.ndarray, blank: np.ndarray) -> np.ndarray:
         blank: Image of the sensor without an object, in [0, 1], `(height, width, 3)`.
 
     Returns:
-        Differences in [0, 1], `(n,)`. The difference is 0 for an image without an object.
+        Differences in [0, 1], `(n,)`. The difference is 0 for an image that equals `blank`.
     """
     return np.abs(visual - blank).mean((1, 2, 3))

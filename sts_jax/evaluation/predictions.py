@@ -155,13 +155,13 @@ def predict(
 ) -> Predicted:
     """Predict the last frames of held-out trajectories with a model, from some of its inputs.
 
-    The predicted outcome follows from the predicted pose. The outcome probabilities are those of the model, if it
-    predicts any. Otherwise, they are the shares of the outcomes among the samples, if there are samples.
+    The predicted outcome follows from the predicted pose. If the model predicts outcome probabilities, the result
+    contains these probabilities. If the model predicts samples but no outcome probabilities, the outcome probabilities
+    are the shares of the outcomes among the samples.
 
-    If the model predicts no pose, the outcome follows from the predicted visual image. This requires a scenario with
-    two outcomes, and the arguments `validation` and `blank`. If the image shows no object, the outcome is `FELL_OFF`.
-    If the image shows an object, the outcome is the scenario's other outcome. The outcome is None if the scenario has
-    more than two outcomes, or if `validation` or `blank` is None.
+    If the model predicts no pose, the outcome follows from the predicted visual image. If the image shows no object,
+    the outcome is `FELL_OFF`. If the image shows an object, the outcome is the scenario's other outcome. If the
+    scenario has more than two outcomes, or if `validation` or `blank` is None, the outcome is None.
 
     Args:
         predictor: The model.

@@ -103,7 +103,8 @@ class Metric:
             raise ValueError("name of a metric is empty: give a name for the summaries, such as 'height_error'")
         if self.errors is None and self.statistic is None:
             raise ValueError(
-                f"metric {self.name!r} has neither `errors` nor `statistic`: give a function for at least one"
+                f"metric {self.name!r} has neither `errors` nor `statistic`: give a function for one of these two "
+                "arguments or for both"
             )
         if type(self.digits) is not int or self.digits < 0:
             raise ValueError(f"metric {self.name!r}: `digits` must be a whole number >= 0, got {self.digits!r}")

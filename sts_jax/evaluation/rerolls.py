@@ -1,7 +1,8 @@
 """The ceiling: the best possible prediction of a last frame from the first pose.
 
-It comes from re-rolls. A re-roll is another simulation of the same first pose and condition with newly drawn hidden
-values. Hidden values are properties that a camera cannot see, such as the fill level and the friction.
+The ceiling is computed from re-rolls. A re-roll is another simulation of the same first pose and condition with
+newly drawn hidden values. Hidden values are properties that a camera cannot see, such as the fill level and the
+friction.
 """
 
 import concurrent.futures
@@ -40,9 +41,9 @@ def ceiling(
     released at rest in its first pose, with the same condition (an input of some scenarios, such as an acceleration of
     the pad). Each re-roll draws new values of the properties that a camera cannot see, such as fill level and friction.
 
-    The true last frame is one more draw from the same distribution, so the prediction is calibrated. With infinitely
-    many re-rolls, it has the best expected log loss of the outcome and the best expected cross-entropy of the images
-    among all predictions from the shape, the pose and the condition.
+    The re-rolls and the true trajectory are draws from the same distribution. The prediction is therefore calibrated.
+    With infinitely many re-rolls, the prediction has the best expected log loss of the outcome and the best expected
+    cross-entropy of the images among all predictions from the shape, the pose and the condition.
 
     The tactile image of the first frame reveals a part of the properties that a camera cannot see. A model that uses
     this image can therefore exceed the ceiling.
@@ -78,10 +79,10 @@ def ceiling(
     off = np.abs(first - test.pose[:, :1]).max()
     if not off <= _SAME:
         raise RuntimeError(
-            "the first pose of a re-roll differs from that of the held-out trajectory. One of the 7 numbers of the "
-            f"pose (position in metres and quaternion) is off by {off:.3g}, but at most {_SAME:g} is allowed. This is "
-            "an error in sts_jax: adapt _replayed in sts_jax/evaluation/rerolls.py to the random keys that "
-            "physics.simulate uses"
+            "the first pose of a re-roll differs from the first pose of the held-out trajectory. The difference in one "
+            f"of the 7 numbers of the pose (position in metres and quaternion) is {off:.3g}, but at most {_SAME:g} is "
+            "allowed. This is an error in sts_jax: adapt _replayed in sts_jax/evaluation/rerolls.py to the random keys "
+            "that physics.simulate uses"
         )
     pose, wrench = (np.asarray(leaf[:, -1]) for leaf in (traj.pose, traj.wrench))
     drawn = _drawn(collection, sensor, bodies, np.repeat(place, times), pose, wrench, test.visual.shape[2])
@@ -123,7 +124,7 @@ def _replayed(
         """A scenario whose first poses are given instead of drawn."""
 
         def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-            """The start of the body whose trajectory has this random key. The pose is NaN if no body has the key."""
+            """The start of the trajectory that has this random key. The pose is NaN if no trajectory has this key."""
             del shape, pad
             same = (jnp.asarray(known) == jax.random.key_data(key)).all(-1)
             mine = jnp.asarray(body)[jnp.argmax(same)]

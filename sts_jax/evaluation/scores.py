@@ -46,10 +46,10 @@ def score(
         outcomes: The outcomes of the scenario, `scenario.outcomes`. They are needed if the prediction has
             `outcome_probability`.
         frequency: Frequency of each of the c outcomes among the training trajectories, `(c,)`, from
-            `evaluation.frequency`. None: the predicted outcome is `predicted.outcome`, or the outcome with the
-            largest probability if `predicted.outcome` is None.
-        metrics: The metrics of the evaluation. The function calls `Metric.errors` of the metrics that have it, and
-            stores the results in `Scores.further`.
+            `evaluation.frequency`. If `frequency` is None, the predicted outcome is `predicted.outcome`, or the outcome
+            with the largest probability if `predicted.outcome` is None.
+        metrics: The metrics of the evaluation. For each metric that has a function `Metric.errors`, `score` calls this
+            function and stores the result in `Scores.further`.
 
     Returns:
         The errors of the items that are predicted.

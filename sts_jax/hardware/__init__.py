@@ -1,4 +1,4 @@
-"""The real sensor: camera, LED controller, calibration, and recording. It uses NumPy, not JAX."""
+"""The real sensor: camera, LED controller, calibration, and recording. This package uses NumPy, not JAX."""
 
 from sts_jax.hardware.calibration import (
     Board,

@@ -23,10 +23,10 @@ class Connection:
     """An open serial port to the LED controller. Several threads may use one connection."""
 
     def __init__(self, name: str, baud: int):
-        """Open the port. The errors are those of `ports.open_port`.
+        """Open the port. This method raises the same errors as `ports.open_port`.
 
         Args:
-            name: Name of the device, or a URL of pyserial.
+            name: Name of the port, such as `/dev/ttyACM0`, or a pyserial URL, such as `socket://localhost:7000`.
             baud: Rate of the serial line (baud).
         """
         self.name = name

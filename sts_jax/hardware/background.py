@@ -1,4 +1,4 @@
-"""`Background`: a thread that takes pairs continuously."""
+"""`Background`: a thread that takes pairs of a visual and a tactile image continuously."""
 
 import threading
 from collections.abc import Callable

@@ -200,7 +200,7 @@ def save_board(
 
 
 def find_board(image: NDArray[np.uint8], board: Board = Board()) -> FoundCorners:
-    """Find the corners of a board in a raw image, which is an unchanged image of the camera.
+    """Find the corners of a board in a raw image, which comes from the camera without any changes.
 
     Args:
         image: Raw image, shape (height, width, 3) for RGB or (height, width) for grey, uint8.
@@ -248,10 +248,10 @@ def calibrate(
         The lens with the camera's pose relative to the pad, and the reprojection error of each image.
 
     Raises:
-        CalibrationError: Too few images show the board. Or the board on the pad is not found. Or the plane of this
-            board is tilted by more than 30 degrees against the image plane. Or the edges of this board are rotated by
-            more than 30 degrees against the edges of the image. Or the board has nearly the same tilt in all images.
-            Or the reprojection error of an image is larger than `largest_error`.
+        CalibrationError: Too few images show the board. Or, in the image with the index `on_pad`, the board is not
+            found, or the plane of the board is tilted by more than 30 degrees against the image plane, or the edges of
+            the board are rotated by more than 30 degrees against the edges of the image. Or the board has nearly the
+            same tilt in all images. Or the reprojection error of an image is larger than `largest_error`.
         ValueError: The images have different sizes or are not uint8, or `on_pad` is not the index of an image.
     """
     height, width = _common_size(images)
@@ -280,10 +280,10 @@ def fit_lens(
         The lens with the camera's pose relative to the pad, and the reprojection error of each image.
 
     Raises:
-        CalibrationError: Too few images show the board. Or the board on the pad is not found. Or the plane of this
-            board is tilted by more than 30 degrees against the image plane. Or the edges of this board are rotated by
-            more than 30 degrees against the edges of the image. Or the board has nearly the same tilt in all images.
-            Or the reprojection error of an image is larger than `largest_error`.
+        CalibrationError: Too few images show the board. Or, in the image with the index `on_pad`, the board is not
+            found, or the plane of the board is tilted by more than 30 degrees against the image plane, or the edges of
+            the board are rotated by more than 30 degrees against the edges of the image. Or the board has nearly the
+            same tilt in all images. Or the reprojection error of an image is larger than `largest_error`.
         ValueError: `on_pad` is not the index of an image.
     """
     width, height = size
@@ -345,12 +345,12 @@ class _Fit:
 
     @property
     def unknowns(self) -> NDArray[np.float64]:
-        """Focal lengths, centre, k and poses as one vector, shape (8 + 6 images,)."""
+        """Focal lengths, centre, k and the poses of m images as one vector, shape (8 + 6 m,)."""
         return np.concatenate([self.focal, self.center, self.k, self.poses.ravel()])
 
     @classmethod
     def of(cls, views: _Views, unknowns: NDArray[np.float64]) -> "_Fit":
-        """Project the corners with a vector of unknowns and compute the residuals."""
+        """Project the corners with the lens and the poses in `unknowns`, and compute the residuals."""
         fx, fy, cx, cy, k1, k2, k3, k4 = unknowns[:8].tolist()
         poses = unknowns[8:].reshape(-1, 6)
         matrices = Rotation.from_rotvec(poses[:, :3]).as_matrix()[views.image]
@@ -473,10 +473,10 @@ def _check_tilts(poses: NDArray[np.float64]) -> None:
     spread = math.acos(float(np.clip((normals @ normals.T).min(), -1, 1)))
     if spread < LEAST_TILT:
         raise CalibrationError(
-            f"the tilts of the board in the images differ by at most {math.degrees(spread):.0f} degrees. To "
-            "compute the focal length, two of the images must have tilts that differ by at least "
-            f"{math.degrees(LEAST_TILT):.0f} degrees. Hold the board with tilts of 20 to 40 degrees in some images, "
-            "each time towards another side."
+            "the largest difference between the tilts of the board in any two images is "
+            f"{math.degrees(spread):.0f} degrees, but at least {math.degrees(LEAST_TILT):.0f} degrees are needed to "
+            "compute the focal length. Hold the board with tilts of 20 to 40 degrees in some images, each time towards "
+            "another side."
         )
 
 
@@ -502,8 +502,8 @@ def _pose_on_pad(
             raise CalibrationError(
                 f"the board of image {index} is {words} the image plane by {math.degrees(angle):.0f} degrees, but at "
                 f"most {math.degrees(MOST_TILT_ON_PAD):.0f} degrees are allowed for a board on the pad. Set `on_pad` "
-                "to the index of the image in which the board lies on the pad, or mount the camera parallel to the "
-                "pad, so that the edges of the pad are horizontal and vertical in the image."
+                "to the index of the image in which the board lies on the pad, or mount the camera so that the "
+                "image plane is parallel to the pad and the edges of the pad are horizontal and vertical in the image."
             )
     (x, y, z), (tx, ty, tz) = sensor.as_rotvec().tolist(), pose[3:].tolist()
     return (x, y, z), (tx, ty, tz)

@@ -144,9 +144,9 @@ class Camera:
 
     @property
     def locked(self) -> dict[str, float]:
-        """The fixed settings of a device, such as {"exposure": 200.0}, by their field names in `CameraConfig`.
+        """The locked settings of a device and the values of these settings, such as {"exposure": 200.0}.
 
-        Empty for streams and files.
+        The keys are field names of `CameraConfig`. For streams and files, the result is empty.
         """
         return self._connected().held
 

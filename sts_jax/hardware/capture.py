@@ -35,8 +35,8 @@ class Capture:
     """A device, a stream or a video file that is open for reading.
 
     If the size of a stream's frames changes, FFmpeg rescales the frames, and OpenCV does not report the change. This
-    class therefore decodes the frames of motion JPEG streams itself. Decoding keeps the size of each frame and rejects
-    incomplete frames.
+    class therefore decodes the frames of motion JPEG streams itself. The decoder of this class keeps the size of each
+    frame and rejects incomplete frames.
     """
 
     def __init__(self, config: CameraConfig):

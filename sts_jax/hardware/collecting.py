@@ -1,4 +1,8 @@
-"""`collect`: the loop that reads a sensor, guides a person, and saves trajectories in a session."""
+"""`collect`: the loop that reads a sensor, instructs a person, and saves trajectories in the folder of a session.
+
+A trajectory consists of a pair of images of an object that a person holds on the pad, and a pair of images of the same
+object at rest after its release.
+"""
 
 import dataclasses
 import enum
@@ -84,7 +88,7 @@ class AutomaticPerson:
     """A `Person` that confirms every recorded trajectory automatically. Another program must move the objects."""
 
     def __init__(self) -> None:
-        """Begin in the stage `CLEAR`."""
+        """Begin in the stage `CLEAR`, in which everything is taken off the pad."""
         self._stage = Stage.CLEAR
 
     def show(self, view: View) -> None:

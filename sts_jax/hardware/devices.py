@@ -95,7 +95,9 @@ def users_of(device: Path) -> tuple[int, ...]:
 
 @contextlib.contextmanager
 def locked(config: CameraConfig) -> Iterator[None]:
-    """Lock a device or a stream against use by others while the context is active. Video files are not locked.
+    """Lock a camera against use by others while the context is active.
+
+    The camera is a device or a network stream. If the source of `config` is a video file, nothing is locked.
 
     Args:
         config: Configuration of the camera.

@@ -53,7 +53,7 @@ class EmulatedController:
         return sent + b"".join(self._answer(line + b"\n", now_s) for line in lines if line)
 
     def tick(self, now_s: float) -> bytes:
-        """Turn the lights off if no valid request has arrived within the watchdog's period, `watch_ms`.
+        """Turn the lights off if no valid request has arrived for the watchdog's period (attribute `watch_ms`).
 
         Args:
             now_s: Current time, on the same clock as `now_s` of the constructor (s).

@@ -120,8 +120,8 @@ class RecordedFilm(Film):
             self._files[stream] = path.open("rb")
         except OSError as error:
             raise type(error)(
-                f"{path} cannot be read ({error}). According to {FRAMES}, it contains {len(places)} images. Check the "
-                "file, or copy the recording again."
+                f"{path} cannot be read ({error}). According to {FRAMES}, this video contains {len(places)} images. "
+                "Check the video, or copy the recording again."
             ) from error
         size = path.stat().st_size
         there = sum(place.offset + place.size <= size for place in places)
@@ -207,13 +207,14 @@ class VideoFilm(Film):
 
         Args:
             visual: Path of the video of the visual stream.
-            tactile: Path of the video of the tactile stream. Both videos must have the same length.
+            tactile: Path of the video of the tactile stream. The numbers of frames of the two videos may differ by at
+                most one.
             fps: Frames per second of both videos. None: the rate that the header of the visual video states.
 
         Raises:
             CameraError: A file is missing, damaged or not a video.
-            ValueError: The lengths differ by more than one frame, `fps` is not positive and finite, or a path
-                names a device or a stream.
+            ValueError: The numbers of frames differ by more than one, `fps` is not positive and finite, or a path
+                names a device or a network stream.
         """
         if fps is not None and not (fps > 0 and math.isfinite(fps)):
             raise ValueError(f"fps must be > 0 and finite, got {fps}")

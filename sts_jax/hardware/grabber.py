@@ -43,8 +43,8 @@ class Grabber:
 
     It runs from the call of `Camera.connect` to the call of `Camera.disconnect`.
 
-    Only this thread opens, reads and closes the source, which is a device, a stream or a video file. While the thread
-    runs, no other `Camera` can use the device or the stream.
+    Only this thread opens, reads and closes the source, which is a device, a network stream or a video file. While the
+    thread runs, no other `Camera` can use the device or the network stream.
     """
 
     def __init__(self, config: CameraConfig):

@@ -311,12 +311,13 @@ def _enter(state: State, stage: Stage) -> State:
 def has_contact(config: GuideConfig, empty: EmptyPad, observation: Observation) -> bool:
     """Return True if the tactile image shows a contact.
 
-    The tactile image is divided into 48 rows of 64 small blocks. The image shows a contact if at least
-    `config.contact_blocks` small blocks differ from the empty pad by more than a threshold. The median difference over
-    all small blocks is first subtracted from each difference, so that a change in the brightness of the whole image is
-    not a contact. The threshold is `config.deviations` times the noise, but at least `config.smallest_change` and at
-    most `config.largest_threshold`. The noise is the larger one of two estimates: `sqrt(1 + 1 / config.pairs)` times
-    the noise in `empty`, and 1.4826 times the median absolute difference.
+    The tactile image is divided into 48 rows of 64 small blocks. The function computes the difference of each small
+    block from the same block of the empty pad. The median of these differences is then subtracted from each difference,
+    so that a change in the brightness of the whole image is not a contact. The image shows a contact if the remaining
+    differences of at least `config.contact_blocks` small blocks exceed a threshold. The threshold is
+    `config.deviations` times the noise, but at least `config.smallest_change` and at most `config.largest_threshold`.
+    The noise is the larger of two estimates: `sqrt(1 + 1 / config.pairs)` times the noise in `empty`, and 1.4826 times
+    the median absolute value of the remaining differences.
 
     Args:
         config: Thresholds.

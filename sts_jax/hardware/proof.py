@@ -51,14 +51,14 @@ class ProvenFrames:
         timeout_s: float,
         reconnect_s: float,
     ):
-        """Keep the open devices. Call `measure_settling` or `see_both` before the first image.
+        """Store the open devices. Call `measure_settling` or `see_both` before the first image is taken.
 
         Args:
             camera: The connected camera.
             leds: The open LED controller.
             levels: Duty cycles of the four channels in the tactile stream, 0 to 255.
             exposures: Exposures of the visual and of the tactile stream, in the unit of the camera's driver. If the
-                two exposures are equal, the camera's exposure is not set. None: not changed.
+                two exposures are equal, or if `exposures` is None, the camera's exposure is not changed.
             timeout_s: Longest wait for a frame in `measure_settling` and `see_both`, and while `shot` repeats a switch
                 of the lights (s).
             reconnect_s: Longest search for a controller that was lost (s).
@@ -178,7 +178,7 @@ class ProvenFrames:
             The two images.
 
         Raises:
-            LightError, LedError, CameraError: The causes are those of `STS.read`.
+            LightError, LedError, CameraError: `STS.read` lists the causes of these errors.
         """
         first = self.stream
         second: Stream = "tactile" if first == "visual" else "visual"
@@ -209,7 +209,7 @@ class ProvenFrames:
             The image.
 
         Raises:
-            LightError, LedError, CameraError: The causes are those of `STS.read`.
+            LightError, LedError, CameraError: `STS.read` lists the causes of these errors.
         """
         while True:
             try:

@@ -7,7 +7,7 @@ A recording is a folder:
     tactile.mkv       images with light, as a Matroska video
     frames.jsonl      one line for each image: its time, its position in the video file, and the period in which the
                       lights did not change
-    sensor.json       a copy of the sensor file, with copies of its background images, if there is one
+    sensor.json       only if a sensor file was given: a copy of this file. Its background images are copied too
 
 Each image is written before its line in frames.jsonl. After an interruption at any time, each complete line therefore
 refers to a complete image.
@@ -81,7 +81,7 @@ class Recorder:
             origin: Identity of the sensor.
             settling: Settling times of the sensor's lights, which are stored with the recording. None: not stored.
             encoding: "png" is lossless. "jpeg" (quality 95, full colour resolution) needs about a fifth of the space.
-            file: Path of the sensor file or of its folder. The file is copied into the recording. None: there is none.
+            file: Path of the sensor file or of its folder. The file is copied into the recording. None: no copy.
 
         Raises:
             FileExistsError: The folder is not empty.

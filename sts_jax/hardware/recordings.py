@@ -1,7 +1,7 @@
 """Reading, confirming and discarding the recorded trajectories of the real sensor.
 
-A session is a folder of trajectories of one sensor. A trajectory consists of a pair of images of the held object
-(`initial`) and a pair of the object at rest (`final`):
+A session is a folder of trajectories that were recorded with one sensor. A trajectory consists of two pairs of images.
+The pair `initial` shows the held object, and the pair `final` shows the object at rest:
 
     session.json                       the identity of the sensor, and the version of the format
     trajectories/00012/initial/        visual.png, tactile.png and pair.json
@@ -98,7 +98,7 @@ class Recordings:
     """
 
     def __init__(self, folder: str | os.PathLike):
-        """Use `load_recordings`."""
+        """Do not call this constructor. Use `load_recordings` instead."""
         self.folder = Path(folder)
         self.session = read_session(self.folder)
         self.numbers = tuple(e.number for e in list_recordings(self.folder) if e.standing == "confirmed")
@@ -184,7 +184,7 @@ def load_recordings(folder: str | os.PathLike) -> Recordings:
 
 
 def read_session(folder: Path) -> dict[str, Any]:
-    """Return the content of `session.json` in a session's folder. The errors are those of `load_recordings`."""
+    """Return the content of `session.json` in a session's folder. See `load_recordings` for the exceptions."""
     path = folder / SESSION
     try:
         content = _files.read_json(path, "restore it from a backup")
@@ -338,7 +338,8 @@ def encoded_pair(pair: Pair, settling: Settling | None) -> dict[str, bytes]:
     """Encode a pair of images as the files `visual.png`, `tactile.png` and `pair.json`.
 
     Args:
-        pair: The two images, each with the times between which the lights did not change.
+        pair: The two images, each with the start and the end of a time interval in which the lights did not
+            change.
         settling: Settling times of the sensor's lights, which are stored in `pair.json`. None: not stored.
 
     Returns:

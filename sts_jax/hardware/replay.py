@@ -60,8 +60,9 @@ class Replay:
                 all times in `Shot.before` and `Shot.until_s` are NaN.
             speed: Seconds of the recording that are played per second, > 0. None: as fast as the program reads,
                 without missing images.
-            loop: If True, the replay starts again at the end, and `Shot.epoch` continues to increase. If False, reading
-                beyond the end raises `EndOfVideoError`.
+            loop: If True, the replay continues from the beginning after the end of the recording. In each repetition,
+                `Shot.epoch` (number of the camera's connection) is larger than before. If False, reading beyond the end
+                raises `EndOfVideoError`.
             fps: Frame rate of the two videos (frames per second). None: the rate in the header of the visual video.
 
         Raises:

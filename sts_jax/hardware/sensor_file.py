@@ -169,9 +169,9 @@ class Device:
         """Write a sensor file and the background images that it refers to.
 
         `Device.load` reads the device from the sensor file, and `sts_jax.Sensor.load` reads the constants. The images
-        are written before the sensor file, and no file is ever written partially. If the process is killed before all
-        files are written, the new images do not match an older sensor file in the folder, and `Device.load` raises an
-        error.
+        are written before the sensor file, and no file is ever written partially. If the folder contains an older
+        sensor file and the process is killed after a new image was written, the older sensor file does not match the
+        new image. `Device.load` then raises an error.
 
         Args:
             path: Path of the file, ending in .json, or of a folder, in which the file is named `sensor.json`.

@@ -99,7 +99,7 @@ class Session:
     """
 
     def __init__(self, folder: Path, lock: contextlib.ExitStack, settling: Settling | None):
-        """Use `Session.open`."""
+        """Do not call this constructor. Use `Session.open` instead."""
         self.folder = folder
         self._lock, self._settling = lock, settling
         self._next = recordings.next_recording(folder)

@@ -1,4 +1,4 @@
-"""The settling time: the time from a switch of the lights to the first frame that shows only the new lights."""
+"""The settling time: the time after a switch of the lights until the frames show only the state after the switch."""
 
 import dataclasses
 from collections.abc import Sequence

@@ -21,7 +21,7 @@ class NotStillError(TimeoutError):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Shot:
-    """An image of one stream, with the times between which the lights did not change.
+    """An image of one stream, with the start and the end of a time interval in which the lights did not change.
 
     The lights did not change between the times `before.acknowledged_s` and `until_s`. The frame arrived between these
     times, at least one settling time after `before.acknowledged_s`, so it does not show earlier levels of the lights.

@@ -58,9 +58,9 @@ class STS:
     - After the frame arrived, the controller answered the next request. This answer shows that the lights have not
       changed since the acknowledgement.
     - It was not delayed. A delayed frame may have been exposed long before it arrived.
-    - It is not identical to the frame before. Identical frames are allowed if `CameraConfig.frozen_after_s` is None.
-    - It is not black. Black frames are allowed if the last image of the same stream was black, or if no
-      image of this stream has been returned since `connect`.
+    - It is not identical to the frame before. This condition is omitted if `CameraConfig.frozen_after_s` is None.
+    - It is not black. This condition is omitted if the last image of the same stream was black, or if no image of this
+      stream has been returned since `connect`.
 
     All other frames are discarded. Only one thread may use a sensor at a time.
     """
@@ -88,8 +88,9 @@ class STS:
                 frames are discarded for the settling time. None: `connect` measures the settling times, which needs a
                 scene at rest.
             exposures: Exposures of the visual and of the tactile stream, in the unit of the camera's driver. If they
-                differ, the camera must be a device, and the exposure is set at each switch of the lights. If they are
-                equal, `STS` does not set them: use `CameraConfig.exposure` instead. None: not changed.
+                differ, the source of the camera must be a device, not a stream or a file, and the exposure is set at
+                each switch of the lights. If the two exposures are equal, `STS` does not set them: use
+                `CameraConfig.exposure` instead. None: not changed.
             timeout_s: Longest wait for one image (s), not counting the time of a reconnection.
             reconnect_s: Longest search for a controller that was lost (s).
 
@@ -294,7 +295,7 @@ class STS:
             The two images.
 
         Raises:
-            LightError: The time ended before one frame of each stream was proven to show the right lights.
+            LightError: The time ended before one frame of each stream was proven to show the lights in the right state.
             LedError: The controller does not answer, or a lost controller was not found within `reconnect_s`.
             CameraError: The sensor is not connected, or the camera sends no usable frames. For the subclasses of
                 `CameraError`, see `Camera.read`.

@@ -9,15 +9,16 @@ The loss is a negative time-lagged evidence lower bound, summed over subsets of 
 
 - `X` runs over the non-empty subsets of the modalities, and `X_t` are the inputs of these modalities.
 - `asked(X)` are the modalities that the subset has to predict.
-- `q(z | X_t)` is the posterior of the latent `z`, a product of experts. One sample of `z` estimates the expectation.
+- `q(z | X_t)` is the posterior of the latent `z`, a product of experts. `E_{q(z | X_t)}` is the expectation over this
+  posterior, which is estimated from one random draw of `z`.
 - `E_m` is the error of the prediction of modality m: the binary cross-entropy of an image (nats, summed over pixels and
   channels), or the mean squared error of the components of a vector. `lambda_m` is `Modality.weight`.
 - `beta` weights the divergence.
 
-If a sample has inputs, but none from the modalities of a subset, the loss of this sample omits the subset. The reason
-is that the posterior of the subset is the prior, so `z` is random. Decoders that predict targets from a random `z`
-learn to mix the mean target into every prediction. If a sample has no input at all, its loss keeps all subsets, because
-the mean target is then the right prediction.
+If a sample of the batch has inputs, but none from the modalities of a subset, the loss of this sample omits the subset.
+The reason is that the posterior of the subset is the prior, so `z` contains no information about the sample. Decoders
+that predict targets from such a `z` learn to mix the mean target into every prediction. If a sample has no input at
+all, the loss of this sample keeps all subsets, because the mean target is then the right prediction.
 """
 
 from typing import Literal, NamedTuple

@@ -45,7 +45,8 @@ def assemble(
             of `vertices`. None for an object without contents.
         contents_density: Density of the contents (kg/m^3).
         mass: Mass of the object without contents (kg). The masses of all faces are multiplied by one factor, so that
-            their sum is `mass`. If it is None, the mass is computed from `density` and the areas of the faces.
+            their sum is `mass`. If `mass` is None, the mass of the object is computed from `density` and the areas of
+            the faces.
         uv: Texture coordinates of each corner of each face, with v = 0 at the texture's top row. If `uv` is None, all
             coordinates are 0.
         texture: Square texture in linear light, [0, 1]. Its side is 1, 256 or 1024 pixels. If `texture` is None, the
@@ -108,14 +109,15 @@ def corner_normals(
 ) -> Float[np.ndarray, "f 3 3"]:
     """Compute the unit normal at each corner of each face, so that shading is smooth except at sharp edges.
 
-    The normal at a corner is a weighted mean of the normals of the faces that meet at its vertex. A face is included if
-    the angle between its normal and the normal of the corner's own face is less than `crease`. The weight of a face is
-    its interior angle at the vertex.
+    The normal at a corner is a weighted mean of the normals of the faces that meet at the vertex of the corner. The
+    mean includes a face if the angle between the normal of this face and the normal of the corner's own face is less
+    than `crease`. The weight of a face is the interior angle of this face at the vertex.
 
     Args:
         vertices: Vertices of the surface (m).
         faces: Vertex indices of each face. The surface is smooth only where faces share the index of a vertex.
-        crease: Largest angle between the normals of faces that are averaged (rad), 40 degrees by default.
+        crease: Angle between the normals of two faces (rad). At a larger angle, neither face counts in the normals of
+            the other face's corners. Default: 40 degrees.
 
     Returns:
         Normals of the corners. A face without area has the normal (0, 0, 1) and the weight 0.

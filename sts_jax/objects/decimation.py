@@ -1,4 +1,4 @@
-"""Decimation of a surface to fewer faces. Its colours and texture become one colour per corner."""
+"""Decimation of a surface to fewer faces. The surface's colours and texture become one colour per face corner."""
 
 import warnings
 from pathlib import Path
@@ -13,7 +13,7 @@ def decimate(path: Path, surface: Surface, target: int) -> Surface:
     """Reduce a surface to at most `target` faces and vertices, and warn with the old and the new number of faces.
 
     Args:
-        path: Path of the mesh file. The warning and errors contain it.
+        path: Path of the mesh file, for the warning and the error messages.
         surface: Surface to reduce.
         target: Largest number of faces and of vertices.
 

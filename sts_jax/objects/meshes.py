@@ -83,9 +83,10 @@ def load(
 ) -> Body:
     """Load a mesh file as a body. All meshes of the file are merged into one.
 
-    The mesh frame is the file's frame, rotated by `up` and `front`. Its origin is the centroid of the collision hull,
-    the shape with which the body collides. This is the convex hull, reduced to at most 64 vertices. `hull_gap` measures
-    how far the surface lies outside the collision hull. Surfaces that are not closed are visible from both sides.
+    The mesh frame is the file's frame, rotated by `up` and `front`. Its origin is the centroid of the collision hull.
+    The collision hull represents the body in collisions, unless `parts` is True. The collision hull is the convex hull
+    of the mesh, reduced to at most 64 vertices. `hull_gap` measures how far the surface lies outside the collision
+    hull. Surfaces that are not closed are visible from both sides.
 
     The albedo at a point of a face is the texture's value times the interpolated colour of the face's corners, in
     linear light. Textures, 8-bit colours and the diffuse colour `Kd` of an OBJ file are read as sRGB. Colour factors
@@ -107,8 +108,9 @@ def load(
             is. The filled share of the interior is an argument of the function `rigid`. If False, the body has no
             contents.
         strict: If True, a mesh that is not closed or encloses no volume is an error, and so is a missing material or
-            image of an OBJ file. If False, these defects are repaired with a warning. The contents of such a mesh then
-            fill its convex hull, and missing materials and images are left out.
+            image of an OBJ file. If False, these defects are repaired with a warning. The convex hull of a mesh
+            that is not closed or encloses no volume then bounds the contents. Missing materials and images are left
+            out.
         up: Axis of the file, or direction in the file, that becomes +z. The convention of glTF files is "y".
         front: Direction in the file that becomes -y. If `up` is a tuple, None is (0, -1, 0). If `up` is an axis,
             `front` must be None.
@@ -326,11 +328,12 @@ def _body(
         fault = "encloses no volume" if closed else "is not closed"
         if strict:
             raise ValueError(
-                f"{path}: the mesh {fault}: repair the mesh, or give strict=False to use the volume of its convex hull"
+                f"{path}: the mesh {fault}: repair the mesh, or give strict=False to use its convex hull as the "
+                "interior"
             )
         if holds:
             warnings.warn(
-                f"{path}: the mesh {fault}, so the volume of its convex hull is used ({hull.volume * 1e6:.3g} ml)",
+                f"{path}: the mesh {fault}, so its convex hull ({hull.volume * 1e6:.3g} ml) bounds the contents",
                 stacklevel=3,
             )
         if len(hull.simplices) > max(len(faces), len(vertices)):  # keeps the body in its size class

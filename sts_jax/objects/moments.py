@@ -17,8 +17,9 @@ def solid_moments(
 
     The moments of a solid are the sum of these moments over all triangles of its closed surface. Let a tetrahedron
     have the corners 0, a, b, c relative to the reference, and let s = a + b + c. The volume of the tetrahedron is
-    v = a . (b x c) / 6. Its first moments (integral of the position r) are v s / 4. Its second moments (integral of
-    r r^T) are v (s s^T + a a^T + b b^T + c c^T) / 20.
+    v = a . (b x c) / 6. Let r be the position relative to the reference. The first moments (integral of r) are v s / 4.
+    The second moments (integral of r r^T) are v (s s^T + a a^T + b b^T + c c^T) / 20. The function converts these
+    moments to moments about the origin.
 
     Args:
         triangles: Corners of the triangles (m).
@@ -27,7 +28,7 @@ def solid_moments(
 
     Returns:
         Integrals of 1, x, y, z, xx, yy, zz, xy, xz and yz over the tetrahedron of each triangle. Coordinates are
-        relative to the origin, not to the reference point. Units are m^3 for 1, m^4 for x to z, and m^5 for products.
+        relative to the origin. Units are m^3 for 1, m^4 for x to z, and m^5 for products.
     """
     origin = np.zeros(3) if reference is None else reference
     r = triangles - origin

@@ -86,8 +86,8 @@ def items(root: Path) -> tuple[list[Item], list[tuple[str, str]]]:
                 raise ValueError("the model has the category _BAD in metadata.csv, so it is not used")
             if len(labels) > 1:
                 raise ValueError(
-                    f"the row of the model in metadata.csv has categories of several classes "
-                    f"({', '.join(sorted(labels))}): keep only the categories of one class"
+                    f"the categories of the model in metadata.csv belong to several classes "
+                    f"({', '.join(sorted(labels))}): keep only the categories that belong to one class"
                 )
             path = next((place / f"{name}.obj" for place in meshes if (place / f"{name}.obj").is_file()), None)
             if path is None:

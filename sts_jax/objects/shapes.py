@@ -1,7 +1,8 @@
 """Building blocks of procedural objects: outlines, surfaces through rings, and painted marks. Lengths are in mm.
 
 An outline is an array (n, 2) of points in a plane, counter-clockwise. Rings are an array (k, n, 3) of k outlines in
-space, which `loft` connects to a surface. A `Part` is such a surface with its colours. An object is a list of parts.
+space. `loft` builds a surface by connecting each ring to the next ring. A `Part` is such a surface with its colours. An
+object is a list of parts.
 """
 
 from collections.abc import Sequence

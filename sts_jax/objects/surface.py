@@ -25,7 +25,7 @@ def merge(path: Path, corners: np.ndarray, colors: np.ndarray, uv: np.ndarray, t
     """Make a surface from separate faces. Corners at the same place become one vertex.
 
     Args:
-        path: Path of the mesh file. Errors contain it.
+        path: Path of the mesh file, for error messages.
         corners: Corners of each face, (f, 3, 3) (m).
         colors: Colour at each corner, (f, 3, 3), in linear light.
         uv: Texture coordinates at each corner, (f, 3, 2).
@@ -45,7 +45,7 @@ def proper(path: Path, surface: Surface) -> Surface:
     """Remove faces that use a vertex twice, and vertices that no face uses.
 
     Args:
-        path: Path of the mesh file. Errors contain it.
+        path: Path of the mesh file, for error messages.
         surface: Surface to clean.
 
     Raises:

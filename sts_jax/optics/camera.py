@@ -55,13 +55,15 @@ def full_window(camera: Camera, resolution: tuple[int, int]) -> Float[Array, "4"
 def object_window(
     camera: Camera, points: Float[Array, "v 3"], resolution: tuple[int, int], *, smallest: float = 0.005
 ) -> Float[Array, "4"]:
-    """Compute a window around an object, as in the paper (supplement, "Training Details").
+    """Compute a window around an object.
+
+    Source: the supplement of Rezaei-Shoshtari et al. 2021, "Training Details".
 
     A window is the rectangle on the gel's outer face that an image shows. The full window (`full_window`) is the
-    largest one with the aspect ratio of the image. The points are projected to the gel's outer face. If their bounding
-    box does not overlap the full window, the result is the full window. Otherwise, the box is clipped to the full
-    window. The result is the smallest window that contains the clipped box, has the aspect ratio of the image and lies
-    within the full window.
+    largest window with the aspect ratio of the image. The points are projected to the gel's outer face. If their
+    bounding box does not overlap the full window, the result is the full window. Otherwise, the box is clipped to the
+    full window. The result is then the smallest window that contains the clipped box, has the aspect ratio of the image
+    and lies within the full window.
 
     Args:
         camera: The camera.

@@ -111,9 +111,9 @@ def hidden_sky(
     """Compute the share of the sky that an object hides from points on the skin, which is the paint on the gel's face.
 
     Parts of the sky are weighted by the cosine of their angle to the vertical. The object is approximated by horizontal
-    slices at a few heights z, from its lowest to its highest point. Under the object, the slice at z is opaque where
-    the underside of the object is below z, and transparent where the underside is above 2 z. In between, the opacity
-    decreases linearly from 1 to 0.
+    slices at a few heights z, from its lowest to its highest point. Each slice has the outline of the
+    object as seen from above. Within the outline, the slice at z is opaque where the underside of the object is below
+    z, and transparent where the underside is above 2 z. In between, the opacity decreases linearly from 1 to 0.
 
     The share of the sky that a half-plane at the height z hides from a point is `f(d) = (1 - d / sqrt(d^2 + z^2)) / 2`.
     Here d is the horizontal distance from the point to the edge of the half-plane, and d is negative if the half-plane
@@ -123,9 +123,9 @@ def hidden_sky(
         hidden = max_z Y_z slice_z X_z^T
 
     Y_z slice_z X_z^T is a product of matrices, and the maximum over the slices is taken in each cell. slice_z is the
-    opacity of the slice in each cell, times the share of the cell that is under the object. X_z[i, j] is the share of
-    the sky that a strip over column j at the height z hides from the centre of column i. Y_z is the same matrix for
-    rows instead of columns. Quadratic splines interpolate between the cells.
+    opacity of the slice in each cell, times the share of the cell inside the outline. X_z[i, j] is the share of the sky
+    that a strip over column j at the height z hides from the centre of column i. Y_z is the same matrix for rows
+    instead of columns. Quadratic splines interpolate between the cells.
 
     Args:
         heights: Heights of the object's underside above the gel's face (m), on a uniform grid of r rows and c columns

@@ -1,10 +1,10 @@
 """A z-buffer in plain JAX: the nearest face at each pixel, for triangles of any size on the screen.
 
-Every face is cut into rows of pixels, and long rows into runs of a few pixels. A loop processes the runs in chunks.
-Each step draws one pixel of every run in a chunk. The work therefore grows with the number of covered pixels and not
-with the product of faces and pixels. Each step is one scatter-min of 32-bit keys, with the depth in the high bits and
-the index of the face in the low bits. The choice of the face has no gradient. Values that are interpolated on the
-chosen face have gradients.
+Every face is cut into rows of pixels, and long rows into runs of a few pixels. An outer loop processes the runs in
+chunks. For each chunk, an inner loop draws one pixel of every run per step. The work therefore grows with the number of
+covered pixels and not with the product of faces and pixels. Each step is one scatter-min of 32-bit keys, with the
+depth in the high bits and the index of the face in the low bits. The choice of the face has no gradient. Values that
+are interpolated on the chosen face have gradients.
 
 Pixel coordinates are (column, row). The centre of a pixel has whole numbers. Columns increase to the right and rows
 downwards. The order of a point is a number that is smaller for nearer points and affine across a face on the screen. It

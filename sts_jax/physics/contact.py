@@ -5,16 +5,16 @@ the box. The edges of a small object on a large pad then have contacts with the 
 push the object. The object then never comes to rest, or is thrown off. MJX would also compile its test again for every
 mesh.
 
-The pad and the stop wall of the slope are boxes whose sides are parallel to the axes. Their contacts with a convex hull
-are therefore of three kinds:
+The pad and the stop wall of the slope are boxes whose sides are parallel to the axes. The contacts of a convex hull
+with such a box can be of four kinds. This module computes three of these kinds:
 
-- A vertex of the hull lies inside the box. It is pushed out through the nearest of the top and the four sides.
+- A vertex of the hull lies inside the box. The vertex is pushed out through the nearest of the top and the four sides.
 - An edge of the hull crosses a rim of the top. The edge is pushed along the common normal of edge and rim.
-- A corner of the top lies inside the hull. The hull is pushed along the normal of the nearest of its lower faces.
+- A corner of the top lies inside the hull. The hull is pushed along the normal of the nearest lower face of the hull.
 
-The distance of each contact is exact along its normal. A fourth kind is left out: an edge of the hull that crosses an
-upright edge of the box below the top. Only objects that have fallen off the pad meet the upright edges. The edges of
-these objects pass through the upright edges. The tests compare the contacts with those of a mesh in C MuJoCo.
+The distance of each contact is exact along its normal. The fourth kind is left out: an edge of the hull crosses an
+upright edge of the box below the top. Only objects that have fallen off the pad meet the upright edges. Nothing stops
+the edges of these objects at the upright edges. The tests compare the contacts with the contacts of a mesh in C MuJoCo.
 """
 
 from typing import NamedTuple

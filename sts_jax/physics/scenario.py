@@ -355,7 +355,8 @@ def variant(scenario: _AnyScenario, name: str) -> _AnyScenario:
         scenario: Scenario to copy. Its other fields stay the same.
         name: Name of the variant. "default" changes nothing. "off" fixes each hidden property at the middle of its
             range, and the contents of an object lie at its base. "wide-friction" draws friction from 0.3 to 0.9.
-            "off-centre" sets `tilt` to pi, so the contents can lie at any side of the object, as in `Inclined()`.
+            "off-centre" lets the contents settle while the object has any orientation (`tilt` is pi), so the contents
+            can lie at any side of the object, as in `Inclined()`.
 
     Returns:
         A scenario of the same class.

@@ -1,7 +1,8 @@
 """Calibration of predictions: correction of the density of the final pose, and of the contrast of samples.
 
-The encoders estimate the states of training objects better than the states of other objects. The transition learns its
-density from training objects, and this density is too narrow for other objects. The error depends on the inputs.
+The encoders estimate the states of training objects better than the states of other objects. The transition is the
+network that predicts the density of the final pose. The transition learns from training objects, and its density is too
+narrow for other objects. How much too narrow the density is depends on the inputs.
 
 Three numbers for each subset of the inputs correct the density: an exponent of the probabilities of the outcomes, an
 exponent of the weights of the mixture, and a factor of the variances. They are temperatures in the sense of Guo et al.

@@ -49,8 +49,9 @@ def fit(
     """Fit the calibration of a model to trajectories that its training did not see.
 
     The calibration has four values for each subset of the inputs. The first three maximise the likelihood of the true
-    outcomes and final poses, multiplied by a prior that favours values near 1. The fourth is the contrast, out of
-    `CONTRASTS`, at which the gradient energy of samples is nearest to that of the true images.
+    outcomes and final poses, multiplied by a prior that favours values near 1. The fourth value is the contrast, which
+    is the sharpness of the outlines in sampled images. The contrast is chosen out of `CONTRASTS`, so that the gradient
+    energy of the samples is nearest to the gradient energy of the true images.
 
     Args:
         graphdef: Definition of the model, from `init`.

@@ -6,8 +6,9 @@ sum of these terms. NLL is a negative log likelihood.
 
 - `state` and `doubt`: the squared error of the state code that each encoder estimates, and the NLL by which the encoder
   learns the variance of this error
-- `outcome` and `pose`: the NLL of the true outcome, and the NLL of the true final pose and of the rotation to it, under
-  the transition's density. Each NLL is a mean over the beliefs from all non-empty subsets of the inputs
+- `outcome` and `pose`: the NLL of the true outcome, and the NLL of the true final pose and of the rotation from the
+  first to the final pose. The transition network predicts the density from a belief, which is the Gaussian over the
+  codes that `fuse` computes. Each NLL is a mean over the beliefs from all non-empty subsets of the inputs
 - `visual` and `tactile`: the cross-entropy of the rendered images of the last frame, minus the entropy of the targets.
   `visual` is a sum over the pixels that show the object. `tactile` is a sum over all pixels
 - `first`: the sum of the terms `visual` and `tactile`, but computed for the input images of the first frame
@@ -211,8 +212,8 @@ def loss(
             side `input_size`, and pose codes `pose` `(n, 12)`.
         targets: Images `visual` and `tactile` of the last frame `(n, size, size, 3)` in [0, 1] with the side
             `image_size`. State codes `state` of the first frames, `(n, code)`, and pose codes `pose` of the last
-            frames, `(n, 12)`. The array `outcome`, `(n,)`, has an index into the list of the scenario's outcomes for
-            each trajectory.
+            frames, `(n, 12)`. The array `outcome`, `(n,)`, has one number for each trajectory: the index of its
+            outcome in the list of the scenario's outcomes.
         empty: `visual` and `tactile` image of the empty sensor in [0, 1], with the side `input_size`.
         present: Masks `(n,)` of the inputs. True means that the item has the input. An input without a mask is present
             in all items. Each item must have at least one input. Values of items whose mask is False have no influence

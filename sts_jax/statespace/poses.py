@@ -1,7 +1,7 @@
 """Pose codes of 12 numbers, and their rotation into a coordinate frame that follows the object's heading.
 
 A pose code is the position divided by `training.Preprocessing.position_scale`, then the nine entries of the rotation
-matrix, row by row. It is the matrix that maps the mesh frame to the sensor frame.
+matrix, row by row. The rotation matrix maps the mesh frame to the sensor frame.
 
 The heading of an object is a direction in the plane of the pad that turns with the object. On a level pad, a rotation
 of the whole scene about the z axis changes neither gravity nor the plane of the pad. The networks therefore work in a
@@ -62,7 +62,7 @@ def certainty(code: Float[Array, "*n 12"]) -> Float[Array, "*n"]:
 
 
 def matrix(code: Float[Array, "*n 12"]) -> Float[Array, "*n 3 3"]:
-    """The rotation matrix that each pose code contains. For a mean of pose codes, it is a mean of rotation matrices."""
+    """The rotation matrix in each pose code. The matrix in a mean of pose codes is a mean of rotation matrices."""
     return code[..., 3:].reshape(*code.shape[:-1], 3, 3)
 
 

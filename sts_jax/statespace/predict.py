@@ -54,8 +54,9 @@ def sample(
         empty: `visual` and `tactile` image of the empty sensor, `(size, size, 3)` in [0, 1].
         condition: Known quantities of the scenario such as an acceleration, `(n, c)`, from
             `training.Preprocessing.encode_condition`. None if the model has no condition.
-        correction: Calibration of the density of the final pose and of the contrast, from `fit_calibration`. None
-            leaves the density unchanged.
+        correction: Calibration from `fit_calibration`, which corrects the density of the final pose and sets the
+            contrast. The contrast is the sharpness of the outlines in the sampled images. With None, the density is
+            unchanged, and the contrast is the default of `compose`.
         num: Number of final poses for each item.
         drawn: Number of final poses with rendered visual and tactile images, from 1 to `num`. A random appearance code
             is drawn for each of these poses.
@@ -86,7 +87,11 @@ def sample(
 
 
 class Drawn(NamedTuple):
-    """Samples whose images are not composed yet: k final poses for each of n items, and layers of `drawn` of them."""
+    """Samples without complete images: k final poses for each of n items, and layers for some of these poses.
+
+    Of the k poses of an item, only the poses with index 0 to `drawn` - 1 have layers. `drawn` is an argument of `draw`.
+    `compose` makes complete images from the layers, see `networks.Layers`.
+    """
 
     belief: Gaussian  # posterior of the state code and the appearance code of the first frame, (n, code + look)
     outcome: Float[Array, "n outcomes"]  # probability of each outcome
@@ -108,7 +113,11 @@ def draw(
     num: int,
     drawn: int,
 ) -> Drawn:
-    """Sample final poses, and render the layers of the images of some of them. The arguments are those of `sample`."""
+    """Sample final poses, and render layers for the first `drawn` poses of each item.
+
+    `compose` makes complete images from the layers, see `networks.Layers`. The arguments after `model` are the same as
+    in `sample`.
+    """
     belief, final = calibration.predict(model, inputs, present, empty, condition, correction)
     end, appearance, outline = jax.random.split(key, 3)
     codes, turns = jax.vmap(lambda key: _final_pose(key, final))(jax.random.split(end, num))

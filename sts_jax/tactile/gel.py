@@ -1,7 +1,10 @@
-"""Model of the gel as a bed of independent springs, in equilibrium with the wrench that the pad exerts on the object.
+"""Model of the gel as a bed of independent springs, and the equilibrium of an object on the gel.
 
-An object is given by the heights of its underside above the gel's undeformed face (m), one for each cell of the gel's
-grid. They are negative where the object presses into the gel. Row 0 has the smallest y, and column 0 the smallest x.
+In equilibrium, the pressure of the springs has the Fz, Mx and My of the wrench that the pad exerts on the object.
+
+An object is given by the heights of its underside above the gel's undeformed face (m), one height for each cell of the
+gel's grid. Heights are negative where the object presses into the gel. Row 0 has the smallest y, and column 0 has the
+smallest x.
 """
 
 import dataclasses
@@ -215,7 +218,7 @@ def _newton(
     def slopes(
         u: Float[Array, "3"], height: Array, x: Array, y: Array, target: Array
     ) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-        """Gradient and Hessian of the energy, with small positive terms on the Hessian's diagonal."""
+        """Gradient and Hessian of the energy in `settle` at u, with small positive terms on the Hessian's diagonal."""
         length = _plane(u, x, y) - height
         weight = (length > 0) + _BOTTOM * (length > limit)
         gradient = _moments(pushed(length), x, y) - target

@@ -17,8 +17,8 @@ def calibrate(workdir: str | os.PathLike[str], arrays: Arrays) -> Model:
 
     For new objects, the predicted density of the final pose is too narrow, and the predicted outcomes can be too
     certain or too uncertain. The calibration corrects the density and the probabilities of the outcomes. The fit also
-    chooses the contrast of samples, see `statespace.fit_calibration`. If the model was calibrated on the same arrays
-    before, nothing is fitted or written.
+    chooses the contrast, which is the sharpness of the outlines in sampled images, see `statespace.fit_calibration`. If
+    the model was calibrated on the same arrays before, nothing is fitted or written.
 
     Args:
         workdir: Folder of the model.

@@ -1,4 +1,7 @@
-"""The training log `metrics.jsonl`. Each line is a record in JSON: a step, and the parts of the loss at this step."""
+"""The training log `metrics.jsonl`.
+
+Each line is a record in JSON: a step, and the mean of each part of the loss since the previous record.
+"""
 
 import json
 from pathlib import Path

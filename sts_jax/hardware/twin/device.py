@@ -93,9 +93,11 @@ class Twin:
             rate: Frame rate of the camera (frames/s).
             imperfections: Deviations of the camera and the lights from ideal ones. Default: `Imperfections()`.
             warp: Lens distortion, made by `lens_warp`. Default: no distortion.
-            seed: Seed of the noise, the jitter and the times of `release_every`.
-            release_every: Mean time for which an object is held plus mean time for which it then rests (s). The twin
-                holds and releases objects at random times by itself. Default: objects move on `command` only.
+            seed: Seed of the image noise, of the random delays of the frames, and of the random times at which the twin
+                holds and releases the object.
+            release_every: Mean time for which the object is held plus mean time for which the object then rests (s).
+                The twin holds and releases the object at random times. Default: the object moves only when `command`
+                is called.
             log: Path of a file that receives one JSON line with the fields of `Exposure` per frame. Default: no log.
             record: Path of a motion JPEG file that receives all frames in the order of the log. Default: no file.
 
@@ -167,8 +169,9 @@ class Twin:
         """
         if self._virtual_s:
             raise RuntimeError(
-                f"the virtual clock of this Twin has advanced to {self._virtual_s} s, but a twin must be served before "
-                "its clock advances: make a new Twin, and serve it first"
+                f"the virtual clock of this Twin has advanced to {self._virtual_s} s, but another clock can replace "
+                "the virtual clock only at 0 s: make a new Twin, and pass the new Twin to Served before you call its "
+                "methods `step`, `capture`, `set` or `ping`"
             )
         self._clock = clock
         self._boot(clock())
@@ -439,4 +442,4 @@ class Twin:
         for reply in map(protocol.decode_reply, lines):
             if isinstance(reply, protocol.State):
                 return Lit(reply.levels, reply.counter, reply.boot, sent_s, self.now_s)
-        raise AssertionError(f"the emulated LED controller must answer a request with its state, got {lines!r}")
+        raise AssertionError(f"the emulated LED controller must answer a request with a State reply, got {lines!r}")

@@ -16,7 +16,8 @@ class Hand(AutomaticPerson):
     `hardware.collect` shows its instructions as a `View`. The hand sends the matching commands to the twin, and
     confirms every trajectory. If an object does not move after its release, the hand confirms the release, as a person
     would. If `hardware.collect` detects no contact of a held object within 3 s, the hand holds the object in the first
-    pose of the next trajectory. The session then skips the number of the trajectory without contact.
+    pose of the next trajectory. The trajectory without contact is not recorded, and its number stays unused in the
+    session.
 
     The session and the scene each give every trajectory a number. The two numbers of a trajectory are equal if the
     scene starts to count at the number of the session's next trajectory

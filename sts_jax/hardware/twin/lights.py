@@ -32,9 +32,9 @@ class LightHistory:
 
         s(t) = a + (s0 - a) exp(-(t - t0) / tau)
 
-    The share is s0 at t0. Its new value a is the mean of the four levels divided by 255, and tau is the argument
-    `rise_s`. LEDs are dimmed by pulses at 31 kHz. These pulses are far shorter than an exposure, so only their mean
-    matters. A `LightHistory` is not thread-safe.
+    The symbol `s0` is the share at t0, `a` is the new value of the share, and `tau` is the argument `rise_s`. The new
+    value is the mean of the four levels divided by 255. LEDs are dimmed by pulses at 31 kHz. These pulses are far
+    shorter than an exposure, so only the mean of the pulses matters. A `LightHistory` is not thread-safe.
     """
 
     def __init__(self, rise_s: float = 0.0):
@@ -55,7 +55,7 @@ class LightHistory:
         """Record a change of the LED levels. A change that keeps the mean of the four levels has no effect.
 
         Args:
-            time_s: Time of the change (s), not earlier than that of the last change.
+            time_s: Time of the change (s), not earlier than the time of the last change.
             levels: Duty cycles of the four LED channels, 0 (off) to 255 (always on).
 
         Raises:

@@ -1,4 +1,4 @@
-"""Computes a camera frame from two images of a scene, without and with light: blending, vignetting, noise and JPEG."""
+"""Blends two images of a scene, LEDs off and LEDs on, into a camera frame with vignetting, noise and JPEG encoding."""
 
 import dataclasses
 import math
@@ -55,8 +55,8 @@ class Imperfections:
 class Ends(NamedTuple):
     """Two images of a scene: with the LEDs off, and with the LEDs at full power.
 
-    `Blender.blend` mixes them to an image at any brightness of the LEDs. Both are in linear light, uint16 of shape
-    (height, width, 3), where 65535 is full scale.
+    The two images are in linear light, uint16 of shape (height, width, 3), where 65535 is full scale. `Blender.blend`
+    mixes the two images to an image at any brightness of the LEDs.
     """
 
     visual: np.ndarray  # image with the LEDs off

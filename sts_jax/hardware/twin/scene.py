@@ -60,8 +60,9 @@ class Scene(abc.ABC):
         """Return the state of the scene at a time.
 
         Args:
-            time_s: Time on the twin's clock (s). The twin computes each frame only after the exposure of this frame. A
-                few commands may therefore have changed the scene between `time_s` and this call.
+            time_s: Time on the twin's clock (s). The twin computes each frame only after the exposure of this frame, so
+                `time_s` is in the past. If a few commands have changed the scene since `time_s`, the returned state
+                must not include these changes.
         """
 
     @abc.abstractmethod
@@ -120,7 +121,7 @@ class Scene(abc.ABC):
 
 
 class Picture(Scene):
-    """A scene of two constant images, such as those of a calibration board without and with light."""
+    """A scene of two constant images, such as images of a calibration board with the LEDs off and with the LEDs on."""
 
     def __init__(self, visual: np.ndarray, tactile: np.ndarray):
         """Store the images.

@@ -37,7 +37,7 @@ class Served:
         host: str = "127.0.0.1",
         http_port: int = 0,
     ):
-        """Start to serve the twin. Its clock becomes `time.monotonic`.
+        """Start to serve the twin. The clock of the twin becomes `time.monotonic`.
 
         Args:
             twin: Twin whose virtual clock has not advanced yet.
@@ -49,7 +49,7 @@ class Served:
 
         Raises:
             RuntimeError: The virtual clock of the twin has advanced.
-            OSError: `host`, `http_port` or `link` cannot be used. The message names it.
+            OSError: `host`, `http_port` or `link` cannot be used. The message names the value that cannot be used.
         """
         twin.run_on(time.monotonic)
         self._twin = twin

@@ -1,4 +1,4 @@
-"""The HTTP server of a twin, with the camera's frames as motion JPEG, the state and the commands."""
+"""The HTTP server of a twin. It sends the camera's frames as motion JPEG and the twin's state, and takes commands."""
 
 import contextlib
 import dataclasses
@@ -53,14 +53,15 @@ class CameraThread:
             self._clients -= 1
 
     def following(self, index: int) -> Made | None:
-        """Return the frame that a client receives next. Waits at most 0.1 s for it.
+        """Return the frame that a client receives next. If there is no such frame yet, wait for a frame up to 0.1 s.
 
         Args:
             index: Number of the frame that the client received last, or -1.
 
         Returns:
-            The newest frame after `index` that is due for delivery. If frames after `index` exist, but none of them is
-            due yet, the first of them is returned. If no frame after `index` exists, the result is None.
+            The newest frame after `index` whose delivery time `due_s` has been reached. If the delivery times of all
+            frames after `index` are in the future, the result is the first of these frames, and the caller waits until
+            the delivery time. If no frame after `index` exists, the result is None.
         """
         with self._changed:
             later = [made for made in self._made if made.exposure.index > index]
@@ -173,7 +174,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             self._json(400, {"error": str(error)})
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Do not log requests."""
+        """Ignore the message, so that the server does not log requests."""
 
     def _unknown(self) -> None:
         known = [f"GET {CAMERA}", "GET /state", *(f"POST /{name}" for name in COMMANDS), "POST /fault?kind="]
@@ -220,7 +221,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         super().setup()
 
     def finish(self) -> None:
-        """Remove the connection from the list."""
+        """Remove the connection from the server's set of connections."""
         self.server.connections.discard(self.request)
         with contextlib.suppress(OSError):  # the client has gone
             super().finish()

@@ -49,12 +49,12 @@ class VirtualSensor:
 
         Args:
             twin: Twin that runs on a virtual clock. The scene must be at rest if the settling times are measured.
-            levels: Duty cycles of the four LED channels in the tactile stream, 0 to 255, not all 0. All are 0 in the
-                visual stream.
+            levels: Duty cycles of the four LED channels in the tactile stream, 0 to 255. At least one level must be
+                above 0. In the visual stream, all LEDs are off.
             settling: Settling times of an earlier measurement. Default: they are measured now.
 
         Raises:
-            ValueError: A level is out of range, or all are 0.
+            ValueError: A level is out of range, or all levels are 0.
             NoContrastError: The lights do not change the image.
             RuntimeError: The twin runs on the real clock.
         """

@@ -1,5 +1,5 @@
 """The eight families of everyday objects, one module each. `objects.procedural` lists them.
 
 The function `parts` of a family draws random dimensions and colours, and returns the parts of an object in millimetres.
-Objects with a front, such as a lens or keys, face -y.
+If an object has a front, such as the side with the lens or the keys, the front faces -y.
 """
