@@ -112,7 +112,7 @@ def release(device: twin.Twin) -> None:
     """Let the object go, and wait until it is at rest.
 
     Raises:
-        AssertionError: `LONGEST_S` after the release, the object is still moving.
+        AssertionError: The object is still moving `LONGEST_S` seconds after the release.
     """
     device.command("release")
     until_s = device.now_s + LONGEST_S

@@ -19,7 +19,7 @@ of a trajectory. The outcome is how the trajectory ends, such as by toppling. Th
   network is trained on other objects.
 - `fill`: the AUC of a small network that separates objects that are more than half full from emptier objects. The
   inputs of the network are visual images of objects in the air, the same images with a tint on the fuller objects, or
-  tactile images. This part exists for the jerked pad only, because the containers stand there.
+  tactile images. This part exists for the jerked pad only, because its scenario contains standing bottles.
 
 Cross-validation folds and bootstrap samples (for 95 % intervals) contain all starts of an object or none. The starts
 are simulated with the defaults of the scenario. All results are printed. The features of the classifiers are in

@@ -367,7 +367,10 @@ def cost_of(faces: int, height: int, width: int) -> dict[str, float]:
 
 
 def cost() -> None:
-    """Print and plot the cost of a frame by number of pixels and of faces, each measured in a new process."""
+    """Print and plot the time and the memory of a frame for several numbers of pixels and of faces.
+
+    Each combination is measured in a new process.
+    """
 
     def measured(faces: int, shape: tuple[int, int]) -> dict[str, float]:
         found = fresh.call("benchmarks.sensor.cost_of", faces, *shape)

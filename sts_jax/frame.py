@@ -196,9 +196,9 @@ def touch(
     Returns:
         Image in [0, 1]. If its shorter side has at least `Sensor.fine_below` pixels, it equals the image
         `Frame.tactile` that `sense` renders for the same imprint. For smaller images, `sense` samples more finely than
-        `touch`. If a number in a traced `window` or in a traced constant of the sensor is invalid, the image shows flat
-        skin, and `window` counts as None. If the invalid number is in a constant, all traced constants also get their
-        default values.
+        `touch`. An invalid number in a traced `window` or in a traced constant of the sensor raises no error. Instead,
+        the image shows flat skin, and `window` counts as None. After an invalid constant, all traced constants also
+        have their default values.
 
     Raises:
         TypeError: `sensor` is not a `Sensor`, or `imprint` or `window` is not an array of numbers.

@@ -1,4 +1,4 @@
-"""Derivative of an imprint whose edges move with the object."""
+"""Derivative of an imprint with respect to the pose of the object, which moves the edges of the imprint."""
 
 import functools
 import operator
