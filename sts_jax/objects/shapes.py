@@ -125,7 +125,8 @@ def loft(
         color: One colour (3,) for the whole surface, one colour for each band, or n colours for each band, in linear
             light. There are k - 1 bands, or k bands if `closed` is True.
         ends: Colours of the faces that close the first and the last ring. If one of the two colours is None, that end
-            is open. By default, both ends are closed and have the colours of their bands.
+            is open. By default, both ends are closed. The end at the first ring then has the first colour of the first
+            band, and the end at the last ring has the last colour of the last band.
         closed: True if a band also connects the last ring to the first. The surface then has no ends, as in a hoop.
         density: Mass per area (kg/m^2).
         interior: True if the surface bounds the contents of the object, such as the water in a bottle.

@@ -41,10 +41,10 @@ def draw(
     scenario: Scenario,
     pad: tuple[float, float],
 ) -> tuple[Start, Hidden]:
-    """Draw the starts and the hidden properties of n trajectories.
+    """Draw a `Start` and the hidden properties of each of n trajectories.
 
-    The draw with index i depends on `key`, on `body[i]`, `nth[i]` and `attempt[i]`, and on the geometry of its body. It
-    does not depend on the other draws.
+    The draw with index i depends on `key`, on `body[i]`, `nth[i]` and `attempt[i]`, and on the geometry of the body
+    `body[i]`. The draw does not depend on the other draws.
 
     Args:
         key: Key of all draws.
@@ -52,11 +52,11 @@ def draw(
         nth: Number of each draw among the draws of the same body, (n,), from 0.
         attempt: Number of times that the trajectory was drawn before and failed, (n,), from 0.
         shapes: Geometry of all bodies, with a leading axis of bodies.
-        scenario: Scenario that draws the starts.
+        scenario: Scenario whose methods `start` and `hidden` are called.
         pad: Size of the pad along x and y (m).
 
     Returns:
-        The starts and the hidden properties, with a leading axis of n.
+        A `Start` and a `Hidden`, whose arrays have a leading axis of n.
     """
 
     def one(body: ArrayLike, nth: ArrayLike, attempt: ArrayLike) -> tuple[Start, Hidden]:

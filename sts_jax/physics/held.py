@@ -22,8 +22,8 @@ def held_wrench(gel: tactile.Gel, body: Body, pose: Float[np.ndarray, "7"], forc
     follows from the pressures of all cells. The function `sts_jax.sense`, called with `pose` and
     the returned wrench, finds the same depth d.
 
-    A sharp corner would sink deeper than the gel allows (`Gel.max_depth`). The object then stops just before this
-    depth, and the returned force is smaller than `force`.
+    If the object would have to sink deeper than the gel allows (`Gel.max_depth`), the object stops just before this
+    depth. The returned force is then smaller than `force`. This happens, for instance, at a sharp corner.
 
     Args:
         gel: Gel of the sensor.
