@@ -2,9 +2,11 @@
 
     python -m benchmarks.depth    # about two minutes on two CPU cores
 
-Prints, for each size and object, how far the depths of interior pixels, of other pixels and of pixels at the silhouette
-differ from embree's depths. A pixel is interior if the rays of its 3x3 neighbourhood all hit the object and the depths
-of these rays differ by less than 1 mm.
+Prints, for each size and object, how far the depths of interior pixels and of all other pixels on the object differ
+from embree's depths. Also prints the number of pixels at the silhouette, and the number of pixels that are on the
+object in only one of the two images. A pixel is interior if the rays of its 3x3 neighbourhood all hit the object and
+the depths of these rays differ by less than 1 mm.
+
 Four objects are procedural, four are loaded from miniworld's meshes (Apache 2.0), one is a concave bowl and one a thin
 sheet. In four poses the object presses on the pad with 1 N, in three it is above the pad, and in three it is partly out
 of view. `tests/test_frame_depth.py` tests some of these cases. The command writes no files.

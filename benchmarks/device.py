@@ -91,7 +91,8 @@ def serve(link: multiprocessing.connection.Connection, path: Path, lag_s: float,
     Args:
         link: Connection to the reading process. This function first sends the address of the camera. The reading
             process then sends MOVE any number of times, to hold or release the twin's object, and FINISHED once. The
-            answer to FINISHED is the camera's log, which maps the key of each image to the light of its frame.
+            answer to FINISHED is the camera's log, which maps the key of each image to the light of its frame. The key
+            is the number of the frame, or for the twin a checksum of the pixels.
         path: Path at which a symbolic link to the controller's port is created.
         lag_s: Time from the end of an exposure to the sending of the frame (s).
         twin: Use images of the digital twin.

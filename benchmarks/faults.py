@@ -340,7 +340,7 @@ def _read(bench: Bench, sensor: hardware.STS, count: Count) -> bool:
 
 
 def host(path: str, url: str, width: int, height: int) -> None:
-    """Read pairs without end. The function `kill` runs this function in a second process, and kills this process.
+    """Read pairs without end, in a second process. The function `kill` starts and kills the second process.
 
     Args:
         path: Port of the controller.

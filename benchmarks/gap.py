@@ -1,4 +1,4 @@
-"""Check of the distances between sets of images that `experiments.gap` computes, for known differences.
+"""Test of the distances that `experiments.gap` computes, on pairs of image sets with known differences.
 
     python -m benchmarks.gap                                                  # about ten minutes
     python -m benchmarks.gap --out benchmarks/results/gap/known.txt           # also write the table
