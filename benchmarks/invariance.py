@@ -4,8 +4,9 @@
     python -m benchmarks.invariance --num 300   # about 5 minutes
     python -m benchmarks.invariance --only jerked-bottles
 
-There are three cases. A box and a bottle are released 20 mm above the pad in any orientation, and each run is labelled
-by the face that is down at the end. Bottles on the jerked pad are labelled by outcome. Each case is computed in several
+There are three cases. In the first two, a box or a bottle is released 20 mm above the pad in any orientation, and each
+run is labelled by the face that is down at the end. In the third case, bottles stand on a pad that is jerked sideways
+(`physics.Perturbed`), and each run is labelled by its outcome, such as "topples". Each case is computed in several
 ways, which are called sides:
 
 - "ours": `simulate` with MJX
@@ -23,9 +24,9 @@ C MuJoCo keeps at most four contacts of a mesh that stands on a face. A round ba
 "ours".
 
 The command prints the share of each label on our side and on each other side, with the 95 % interval of the difference.
-All sides have the same starts and hidden values, so each run on our side is paired with a run on each other side. The
-interval is the one for the shares of paired runs (Agresti and Min 2005, with half a count added to each cell). The
-command writes no files.
+All sides have the same starts and hidden properties (such as friction), so each run on our side is paired with a run on
+each other side. The interval is the one for the shares of paired runs (Agresti and Min 2005, with half a count added to
+each cell). The command writes no files.
 """
 
 import concurrent.futures
@@ -167,7 +168,7 @@ def roll(
         num: Number of runs, rounded up to a multiple of the number of bodies.
         bodies: Bodies that replace the case's bodies.
         scenario: A scenario that replaces the case's scenario.
-        seed: Seed of starts and hidden values.
+        seed: Seed of starts and hidden properties, such as friction.
         engine: Engine of `simulate`.
 
     Returns:
@@ -228,7 +229,7 @@ def last_in_c(case: Case, traj: physics.Trajectory, *, every_vertex: bool = Fals
 
     Args:
         case: The case.
-        traj: Trajectories of the case, whose starts and hidden values are used.
+        traj: Trajectories of the case. Their starts and hidden properties, such as friction, are used.
         every_vertex: Add a contact sphere at every vertex of the hull.
         driven: Keep gravity vertical and accelerate the pad, opposite to the horizontal part of the scenario's gravity.
             Otherwise the pad is fixed and gravity is the scenario's.
@@ -296,14 +297,14 @@ def difference(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
 
 
 def sides(case: Case, num: int) -> dict[str, np.ndarray]:
-    """Simulate a case on all sides.
+    """Simulate a case on all sides that the docstring of the module lists.
 
     Args:
         case: The case.
         num: Number of runs on each side.
 
     Returns:
-        The index of the label of every run, by name of the side. Our side is the first.
+        The index of the label of every run, by name of the side. Our side, "ours", is the first.
     """
     other_hand = [objects.mirror(body) for body in case.bodies]
     rolled: dict[str, physics.Trajectory] = {}
@@ -333,7 +334,7 @@ def compare(found: dict[str, np.ndarray], labels: Sequence[str], margin: float =
     """Print the share of every label on our side and on each other side, with the interval of the difference.
 
     Args:
-        found: Index of the label of every run, by name of the side, our side first.
+        found: Index of the label of every run, by name of the side. Our side, "ours", must be the first.
         labels: The labels.
         margin: Limit for the absolute values of both ends of each interval.
 
@@ -357,7 +358,7 @@ def compare(found: dict[str, np.ndarray], labels: Sequence[str], margin: float =
 
 
 def main(args: Args) -> None:
-    """Compare the sides of all cases, or of the case `--only`."""
+    """Compare the sides of all cases, or of the one case that `--only` selects."""
     within = [compare(sides(case, args.num), case.labels) for case in cases() if args.only in (None, case.name)]
     print(f"every interval within {100 * MARGIN:.0f} points: {'yes' if all(within) else 'NO'}")
 

@@ -1,19 +1,19 @@
-"""Seconds of one training step and of one prediction, for the paper's model and for the state-space model.
+"""Time of one training step and of one prediction, for the paper's model and for the state-space model.
 
     python -m benchmarks.learning                    # about 3 minutes on two CPU cores
     python -m benchmarks.learning --only statespace  # one kind of model
     taskset -c 0 python -m benchmarks.learning       # on one core
 
-The line after the device has the time of a training step of the paper's model (`mvae`) for freefall at batch 64. This
-model has the modalities vision, touch and pose. Touch is never an input, so the model predicts all modalities from each
-subset of vision and pose. The same line has the time of a plain implementation, which masks touch in all samples,
-enumerates all seven subsets of the three modalities, and uses XLA's convolutions and transposed convolutions. The next
-lines have the times of training steps with smaller batches, of a training step with vision alone, and of a prediction
-at batch 1. The last lines have the times of a training step of the state-space model for freefall, and of a prediction
-with 16 samples.
+The first line of the output has the name of the device. The second line has the time of a training step of the paper's
+model (`mvae`) for freefall at batch 64. This model has the modalities vision, touch and pose. Touch is never an input,
+so the model predicts all modalities from each subset of vision and pose. The same line has the time of a plain
+implementation, which masks touch in all samples, enumerates all seven subsets of the three modalities, and uses XLA's
+convolutions and transposed convolutions. The next lines have the times of training steps with smaller batches, of a
+training step with vision alone, and of a prediction at batch 1. The last lines have the times of a training step of the
+state-space model for freefall, and of a prediction with 16 samples.
 
-All times are medians of alternating calls. Each function is called once before its measured calls. The command writes
-no files.
+All times are medians of several calls. The calls of the paper's model and of its plain implementation alternate. Each
+function is called once before its measured calls. The command writes no files.
 """
 
 import dataclasses

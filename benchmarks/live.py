@@ -6,8 +6,8 @@ In the digital twin, a hand holds an object in an unstable pose and lets go. Eac
 the images of the held object, as `experiments.live` does. The command prints the skill of the predicted images,
 computed from mean squared errors over all trajectories. The skill is 1 if the prediction is the true image, and 0 if
 the prediction is the mean of the images at rest of the other trajectories. No model was trained with the twin's noise,
-vignetting and leaking light. Only the training trajectories of the model `released` have the scenario `Released`. The
-objects in these trajectories have the same class as the twin's object.
+vignetting and leaking light. The twin's object moves as in the scenario `physics.Released`. Only the model `released`
+was trained on this scenario, with objects of the same class as the twin's object.
 """
 
 import dataclasses
@@ -42,8 +42,8 @@ def collect(args: Args) -> tuple[Pair, list[Pair], list[Pair]]:
     """Record trajectories of the digital twin.
 
     Returns:
-        A pair of images of the empty pad, and for each trajectory a pair of the held object and a pair of the object at
-        rest.
+        A pair of images of the empty pad, a list of pairs of the held object, and a list of pairs of the object at
+        rest. A pair is a visual and a tactile image. Each list has one pair per trajectory.
     """
     # The images during the motion are not read, so one pose per second of the motion is rendered.
     with twin.make(twin.Config(motion_rate=1.0, seed=args.seed)) as device:
@@ -72,12 +72,12 @@ def collect(args: Args) -> tuple[Pair, list[Pair], list[Pair]]:
 def seen(
     views: Views, predictor: sts.Predictor, pairs: list[Pair], index: int, size: tuple[int, int] | None = None
 ) -> np.ndarray:
-    """Prepare one stream of some pairs for a model.
+    """Convert the visual or the tactile images of some pairs to inputs of a model.
 
     Args:
         views: Conversion from raw images of the twin's camera to the view of the simulated pinhole camera.
         predictor: The model.
-        pairs: The pairs, `n` of them.
+        pairs: Pairs of a visual and a tactile image of the twin's camera, `n` of them.
         index: 0 for the visual stream, 1 for the tactile stream.
         size: Height and width of the result, divisors of the height and width of the model's inputs. Each pixel is the
             mean of a block of pixels. Default: the size of the model's inputs.

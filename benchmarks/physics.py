@@ -268,12 +268,12 @@ def scaling(frames: int = 8, chunk: int = 32) -> None:
 
 
 def write_scaling(rows: Sequence[Speeds], device: str, chunk: int) -> None:
-    """Write `scaling.md` and `scaling.png` to RESULTS.
+    """Write steps per second against the number of worlds to `scaling.md` (table) and `scaling.png` (plot) in RESULTS.
 
     Args:
         rows: Steps per second for each number of worlds.
         device: Name of the device, for the title.
-        chunk: Number of worlds in each MJX call of the measurement with several threads.
+        chunk: Number of worlds in each MJX call of the measurement with several threads, for the legend.
     """
     from matplotlib.figure import Figure
 
@@ -296,7 +296,7 @@ def write_scaling(rows: Sequence[Speeds], device: str, chunk: int) -> None:
 
 
 def draw(body: objects.Body, traj: physics.Trajectory) -> None:
-    """Render every frame of one object's trajectories in both streams, and fetch the images to the host."""
+    """Render the visual and tactile images of all frames of `traj`, and fetch the images to the host."""
     gpu = jax.default_backend() != "cpu"
     batch, threads = (GPU_BATCH, 1) if gpu else (RENDER_BATCH, os.cpu_count())
     pose, wrench = (np.asarray(x).reshape(-1, x.shape[-1]) for x in (traj.pose, traj.wrench))
@@ -312,7 +312,7 @@ def draw(body: objects.Body, traj: physics.Trajectory) -> None:
 
 
 def pipeline(count: int) -> None:
-    """Print frames per second of physics, of rendering both streams, and of the pipeline, for drops of a bottle."""
+    """Print frames per second of physics, of rendering, and of both together, for `count` drops of a bottle."""
     engine: physics.Engine = "mujoco" if jax.default_backend() == "cpu" else "mjx"
     chunk = 32 if engine == "mujoco" else count
     body, scenario = objects.make(jax.random.key(0), "bottle"), physics.Freefall()

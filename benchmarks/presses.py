@@ -52,7 +52,7 @@ OUT = Path(__file__).parent / "results" / "presses"
 
 @dataclasses.dataclass(frozen=True)
 class Presses:
-    """Images in [0, 1] and the geometry of their contacts."""
+    """Image without contact, images of the presses, and the circle of contact in each. Colours are in [0, 1]."""
 
     background: Float[np.ndarray, "h w 3"]
     images: Float[np.ndarray, "n h w 3"]
@@ -72,7 +72,7 @@ class Pixels:
 
 
 class Descent(NamedTuple):
-    """State of the optimisation."""
+    """Unknowns of `shader` and state of the Adam optimiser, between two steps of `refine`."""
 
     unknowns: dict[str, Array]
     optimiser: optax.OptState

@@ -1,4 +1,4 @@
-"""Draw a picture that tests whether people can match predicted images at rest with the true images.
+"""Draw a picture that tests whether people can match predicted images of objects at rest with the true images.
 
     python -m benchmarks.recognise runs/freefall --out recognise.png           # about a minute
     python -m benchmarks.recognise runs/freefall --given visual pose --first 20
@@ -49,7 +49,7 @@ def main(args: Args) -> str:
     if len(rows) < NUMBER:
         raise ValueError(
             f"--first is {args.first}, but the held-out list has only {len(rows)} trajectories from index "
-            f"{args.first} on, and {NUMBER} are needed: give a smaller --first"
+            f"{args.first} on, and {NUMBER} are needed: give a smaller --first or a run with more held-out trajectories"
         )
     pairs = data.pairs(rows)
     predictor = sts.Predictor.load(args.workdir / "models" / "statespace")

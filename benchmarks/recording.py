@@ -1,13 +1,13 @@
-"""Duration of writing a pair of images of the real sensor to disk, and size of the files.
+"""Duration of writing a visual and a tactile image to disk as `hardware.Session` does, and size of the files.
 
     python -m benchmarks.recording                  # a few seconds
     python -m benchmarks.recording --folder /mnt    # on another disk
 
 The command writes pairs of a visual and a tactile image as `hardware.Session` does. The folder of a pair contains both
-images as PNG files and the checksums of the files, and is flushed to the disk. The images are smooth, either without
-noise or with noise of standard deviation 1.5 (of 255). For two image sizes, the command prints the size of a pair, the
-median time of encoding, the median time of writing, and the longest time of encoding and writing together. The command
-deletes the files afterwards.
+images as PNG files and the checksums of the files, and is flushed to the disk. The images are synthetic and smooth,
+without noise or with noise of standard deviation 1.5 (of 255). For two image sizes, each without and with noise, the
+command prints the size of the files of a pair, the median time of encoding, the median time of writing, and the longest
+time of encoding and writing together. The command deletes the files afterwards.
 """
 
 import dataclasses

@@ -7,7 +7,8 @@ The command uses the dataset of a run, and trains models in the folder `scaling`
 a share of the training objects (`--shares`), with the largest number of steps in `--steps`. The other models are
 trained on all training objects, with each number of steps in `--steps`. Models that exist already in the folder are not
 trained again. The command prints the errors of the predictions for the held-out objects, and writes a plot of the
-visual skill with 95 % intervals to `--out`.
+visual skill with 95 % intervals to `--out`. The visual skill is a score of the predicted visual images. Perfect images
+have the skill 1, and the mean training image has the skill 0.
 """
 
 import dataclasses
@@ -91,7 +92,7 @@ def train(
 
 
 def best_possible(workdir: Path) -> float | None:
-    """Read the visual skill of the best possible prediction from `metrics.json`. None: no skill is recorded."""
+    """Read the visual skill of the best possible prediction from `metrics.json`, or return None if it is missing."""
     path = workdir / "metrics.json"
     if not path.exists():
         return None

@@ -1,4 +1,4 @@
-"""Frames per second of `sense` and of embree, which traces only the depth, and the cost of a frame by its size.
+"""Frames per second of `sense` and of the ray tracer embree, and cost of a frame per pixel and per face.
 
     python -m benchmarks.sensor             # about 12 minutes on two CPU cores, most of it compilation
     python -m benchmarks.sensor --taxim     # about a minute: tactile images from height maps, compared with taxim
@@ -105,7 +105,7 @@ class Durations(NamedTuple):
 
 
 def finer(body: objects.Body, faces: int | None) -> objects.Body:
-    """Remesh a body to about `faces` faces, by subdivision and decimation. None: return the body unchanged."""
+    """Subdivide and decimate a body to about `faces` faces. If `faces` is None, return the body unchanged."""
     if faces is None:
         return body
     own = np.asarray(body.faces)
@@ -128,10 +128,10 @@ def count(body: objects.Body) -> int:
 
 
 def resting(body: objects.Body, number: int = POSES) -> Inputs:
-    """Place a body upright on the pad, turned about the vertical by `number` angles.
+    """Make poses of a body that stands upright on the pad, at `number` equally spaced angles about the vertical.
 
     Returns:
-        Poses `(number, 7)`, and the wrenches of the pad that carry the weight, `(number, 6)`.
+        Poses `(number, 7)`, and wrenches `(number, 6)` with which the pad carries the weight of the body.
     """
     mass, com, _ = objects.rigid(body, 0.5, 1.0)
     angles = jnp.linspace(0, 2 * jnp.pi, number, endpoint=False)

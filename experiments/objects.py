@@ -83,7 +83,7 @@ def portrait(body: sts.objects.Body, direction: jax.Array, *, size: int) -> jax.
 
 
 def describe(category: str, number: int, body: sts.objects.Body, *, parts: bool) -> str:
-    """Describe one object in a line, as `sts.objects.describe` does.
+    """Describe one object in one line of text, in the format of `sts.objects.describe`.
 
     Args:
         category: Class of the object.

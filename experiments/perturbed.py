@@ -1,4 +1,4 @@
-"""Predict the images and the pose at rest of a bottle on a pad that is jerked, from the first frame and the jerk.
+"""Predict the images and the pose at rest of a bottle on a jerked pad, from the first frame and the jerk.
 
     python -m experiments.perturbed                    # 10 to 30 minutes on two CPU cores
     python -m experiments.perturbed --preset long      # at most 150 minutes, can be stopped and started again
@@ -6,6 +6,8 @@
     python -m experiments.perturbed --preset smoke     # about two minutes, for tests
     python -m experiments.perturbed --preset paper     # the paper's counts and schedule: hours, a GPU helps
     python -m experiments.perturbed --plan             # prints the expected seconds of each stage
+
+A jerk is a short sideways acceleration of the pad. It is not a derivative of the acceleration.
 
 Results go to `runs/perturbed/`: config.json, dataset/, models/NAME/, metrics.json, table.md and figures/*.png. A second
 run with the same `--workdir` resumes after an interruption, and leaves finished results unchanged. `--only train` runs

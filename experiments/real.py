@@ -1,7 +1,7 @@
 """Collect and review trajectories of the real sensor or its digital twin, and learn from them (the paper's Table 2).
 
     python -m experiments.real                    # about 15 minutes, collects 100 trajectories of the twin if needed
-    python -m experiments.real --preset paper     # 500 at 1640x1232, the paper's schedule, prints a time estimate first
+    python -m experiments.real --preset paper     # 500 trajectories at 1640x1232, paper's schedule, estimates the time
     python -m experiments.real --preset smoke     # a short run of every stage, for tests
     python -m experiments.real --plan             # prints the expected seconds of each stage
 
@@ -21,9 +21,10 @@ trajectories of both a device and the twin, so give the twin a separate `--workd
 pad. Training needs the lens and these images.
 
 `collect` guides a person through trajectories: place the object in an unstable pose, hold the object, release the
-object, and wait until the object rests. The initial pair and the final pair of images are each saved immediately, raw
-and uncropped, into `WORKDIR/dataset`. Confirmed trajectories survive an interruption. After an interruption, the same
-command continues with the next trajectory.
+object, and wait until the object rests. A trajectory has two pairs of a visual and a tactile image. The first pair
+shows the held object, and the second pair shows the object at rest. Each pair is saved immediately, raw and uncropped,
+into `WORKDIR/dataset`. Confirmed trajectories survive an interruption. After an interruption, the same command
+continues with the next trajectory.
 """
 
 import argparse

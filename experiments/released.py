@@ -1,6 +1,6 @@
 """Predict the images and the pose at rest of an object that a hand releases, from a frame that shows the held object.
 
-    python -m experiments.released                    # 26 minutes on one CPU core of a computer with other work
+    python -m experiments.released                    # 26 minutes on one CPU core of a busy computer
     python -m experiments.released --preset long      # has not been run to the end yet, resumes after an interruption
     python -m experiments.released --model paper      # the paper's four models instead of the state-space model
     python -m experiments.released --preset smoke     # a few minutes, for tests

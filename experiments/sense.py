@@ -38,7 +38,7 @@ NARROWEST = 160  # smallest width of a panel (pixels). Smaller images are magnif
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """The object, its pose and load, and the picture."""
+    """Options of the command line: the object, its pose, its mass, the force of the pad on it, and the picture."""
 
     # path of a mesh file, name of an object class such as bottle, or `classes` for one object of each class
     mesh: Annotated[str, tyro.conf.Positional]
@@ -180,7 +180,7 @@ def see(
     crop: bool,
     light: float,
 ) -> tuple[sts.Frame, jax.Array]:
-    """Render the frame, and an image with the LEDs at `light` times full power."""
+    """Render all outputs of the sensor (`sts.Frame`), and an image with the LEDs at `light` times full power."""
     frame = sts.sense(sensor, body, pose, wrench, resolution=resolution, crop=crop)
     return frame, sts.expose(sensor, frame, light)
 

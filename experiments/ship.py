@@ -35,14 +35,14 @@ class Args:
 
 
 def ship(workdir: Path, name: str) -> str:
-    """Write the rounded model to `sts_jax/models/NAME`.
+    """Copy the trained model of a work directory to `sts_jax/models/NAME`, with rounded weights.
 
     Args:
         workdir: Work directory with a trained state-space model.
         name: Name of the model in the library.
 
     Returns:
-        A line with the size and the differences of the predictions.
+        A line with the size of the copy, and the differences between predictions of the original and of the copy.
 
     Raises:
         ValueError: The model is too large, or the name is not a Python identifier.
@@ -50,8 +50,8 @@ def ship(workdir: Path, name: str) -> str:
     """
     if not name.isidentifier():
         raise ValueError(
-            f"the name is {name!r}, but it must consist of letters, digits and underscores, and must not begin with a "
-            "digit: give another name, such as --name freefall"
+            f"the name of the model is {name!r}, but it must consist of letters, digits and underscores, and must not "
+            "begin with a digit: give another name, such as --name freefall"
         )
     original = sts.Predictor.load(workdir / "models" / "statespace")
     MODELS.mkdir(exist_ok=True)

@@ -45,7 +45,10 @@ def checked_array(name: str, value: Any, wanted: str) -> np.ndarray | Array:
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} is not an array ({error}): give an array of {wanted}.") from error
     if array.dtype.kind in "OUSMm":
-        raise ValueError(f"{name} is a {type(value).__name__}, but it must be an array of {wanted}.")
+        raise ValueError(
+            f"{name} is a {type(value).__name__} that converts to a NumPy array of dtype {array.dtype}, but it must be "
+            f"an array of {wanted}."
+        )
     return array
 
 

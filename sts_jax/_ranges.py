@@ -1,9 +1,11 @@
 """Allowed ranges of a dataclass's fields, declared in their metadata.
 
 `aspect: float = dataclasses.field(default=4 / 3, metadata=POSITIVE)` declares that every number of the field must be
-> 0. The metadata's keys are "above" (>), "at_least" (>=), "below" (<) and "at_most" (<=). `limits` checks them.
+> 0. The metadata's keys are "above" (>), "at_least" (>=), "below" (<) and "at_most" (<=). `limits`
+compares the numbers of one field with them, and `check` the numbers of all fields.
 """
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,6 +14,7 @@ import numpy as np
 POSITIVE = {"above": 0.0}
 NOT_NEGATIVE = {"at_least": 0.0}
 SHARE = {"at_least": 0.0, "at_most": 1.0}
+COUNT = {"at_least": 1, "whole": True}
 STATIC = {"static": True}  # JAX compiles a program for each value of the field
 
 _SMALLEST = float(np.finfo(np.float32).tiny)  # float32 arithmetic flushes smaller numbers to 0
@@ -39,3 +42,24 @@ def limits(metadata: Mapping[str, Any], array: Any) -> list[tuple[Any, str]]:
     if "at_most" in metadata:
         found.append(((array <= metadata["at_most"]).all(), f"it must be <= {metadata['at_most']:g}"))
     return found
+
+
+def check(config: Any) -> None:
+    """Check the fields of a dataclass that are a number or None. None is always allowed.
+
+    The key "whole" of a field's metadata declares that the field has the type `int`.
+
+    Raises:
+        ValueError: A number is out of its field's range, not finite, or not whole.
+    """
+    for field in dataclasses.fields(config):
+        value, metadata = getattr(config, field.name), field.metadata
+        if not metadata or value is None:
+            continue
+        if metadata.get("whole") and not isinstance(value, int | np.integer):
+            raise ValueError(f"{field.name} must be a whole number, got {value!r}")
+        if not np.isfinite(value):
+            raise ValueError(f"{field.name} must be finite, got {value!r}")
+        for holds, words in limits(metadata, np.asarray(value)):
+            if not holds:
+                raise ValueError(f"{field.name} {words.removeprefix('it ')}, got {value!r}")

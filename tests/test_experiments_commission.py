@@ -256,7 +256,7 @@ def test_a_view_that_the_camera_does_not_see_is_refused(config):
 def test_few_pictures_name_their_folder(tmp_path, pictures):
     folder = held(tmp_path / "board", pictures, 3)
     read = boards.Pictures.read(folder, hardware.Board(), (WIDTH, HEIGHT))
-    with pytest.raises(hardware.CalibrationError, match=r"board do not determine the lens: .*at least 6.*000.png"):
+    with pytest.raises(hardware.CalibrationError, match=r"board failed: .*at least 6.*000.png"):
         read.fit(PINHOLE)
 
 
@@ -474,7 +474,7 @@ def test_a_missing_port_and_another_device_are_named(config, tmp_path, monkeypat
 
 def test_pictures_of_another_size_are_refused(tmp_path, pictures):
     folder = held(tmp_path / "board", pictures, 1)
-    with pytest.raises(ValueError, match=r"000.png has 640 x 480 pixels, but the camera's size is 1640 x 1232"):
+    with pytest.raises(ValueError, match=r"000.png has 640 x 480 pixels, but --width is 1640 and --height is 1232"):
         boards.Pictures.read(folder, hardware.Board(), (1640, 1232))
 
 

@@ -59,7 +59,7 @@ def test_image_sizes_divide_the_resolution_and_suit_the_networks(model, side, si
             {"collection": {"crop": True}},
             r"collection\.crop is True, but it must be False .*: give --collection\.no-crop, or --model paper",
         ),
-        ({"model": "paper", "steps": (5,)}, r"steps must have 4 numbers, one for each of mvae, .* got \(5,\)"),
+        ({"model": "paper", "steps": (5,)}, r"steps must have 4 numbers, got \(5,\): .* each model \(mvae, "),
         ({"splits": ("frame",)}, r"splits must be one or more of object, trajectory, got \('frame',\)"),
         ({"splits": ()}, r"splits must be one or more of object, trajectory, got \(\)"),
     ],

@@ -154,7 +154,7 @@ def test_an_error_of_the_thread_reaches_the_caller():
 def test_unfit_models_are_refused():
     with pytest.raises(ValueError, match="takes no visual images"):
         Live(StubPredictor(modalities=("tactile",)), views(), (), (), lambda: None)
-    with pytest.raises(ValueError, match=r"--condition has 2 numbers, but the model .* needs 3"):
+    with pytest.raises(ValueError, match=r"values of --condition must be 3, got 2: .* leave it out"):
         Live(StubPredictor(condition=3), views(), (), (1.0, 2.0), lambda: None)
 
 

@@ -1,13 +1,16 @@
 """Another loss, optimiser, logger and modality, from outside the library, as `docs/extending.md` shows."""
 
 import json
+import struct
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from extending_page import blocks
 from flax import nnx
+from tensorboardX.proto import event_pb2
 
 from sts_jax import mvae, training
 
@@ -167,6 +170,46 @@ def test_a_logger_receives_each_record_once_in_every_call(tmp_path, kill):
     assert part == whole[: kill // 2]
     assert run("killed") == (whole, False)
     assert run("killed") == (whole, False)  # also of a finished run
+
+
+def scalars(folder):
+    """The names and steps in the event files of TensorBoard, which are records of the format TFRecord."""
+    found = set()
+    for path in folder.iterdir():
+        data = path.read_bytes()
+        while data:
+            (size,) = struct.unpack("<Q", data[:8])
+            event, data = event_pb2.Event.FromString(data[12 : 12 + size]), data[12 + size + 4 :]
+            found |= {(value.tag, event.step) for value in event.summary.value}
+    return found
+
+
+@pytest.mark.slow
+def test_the_code_of_the_page_trains_with_a_penalty_and_another_optimiser_and_writes_to_tensorboard(
+    tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    names = {"model": MODEL, "arrays": arrays(), "config": CONFIG}
+    exec("\n".join(blocks("Another loss, another optimiser, another logger")), names)
+    assert [record["step"] for record in records(tmp_path / "model")] == [2, 4, 6]
+    assert all(record["penalty"] > 0 for record in records(tmp_path / "model"))
+    logged = records(tmp_path / "logged")
+    assert "penalty" not in logged[0]
+    wanted = {(name, record["step"]) for record in logged for name in record if name != "step"}
+    assert scalars(tmp_path / "tensorboard" / "logged") == wanted
+
+
+@pytest.mark.slow
+def test_the_code_of_the_page_trains_a_model_of_pose_and_sound(tmp_path, monkeypatch):
+    """The last pose follows from the sound, so the prediction from sound is better than the mean pose."""
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(0)
+    sound = rng.uniform(-1, 1, (64, 16)).astype(np.float32)
+    pose = rng.uniform(-1, 1, (64, 12)).astype(np.float32)
+    names = {"pose": pose, "sound": sound, "pose_after": sound[:, :12], "sound_after": sound}
+    exec("\n".join(blocks("A further modality")), names)
+    error = np.mean((np.asarray(names["predicted"]["pose"]) - sound[:8, :12]) ** 2)
+    assert error < 0.5 * np.mean((sound[:8, :12] - sound[:, :12].mean(0)) ** 2)
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Function calls in new processes, which measure the time of a first call or the memory of a process."""
+"""Function calls in new processes, to measure the time of a first call or the memory of a process."""
 
 import json
 import os

@@ -1,6 +1,7 @@
-"""Features for a classifier of the outcome of lathed objects on the jerked pad, from vision and from weight.
+"""Features from which a classifier predicts the outcomes of lathed objects on the jerked pad (`physics.Perturbed`).
 
-A lathed object is a solid of revolution, such as a bottle.
+The features come from vision, and optionally from the measured mass. A lathed object is a solid of revolution, such as
+a bottle.
 """
 
 from typing import NamedTuple
@@ -51,12 +52,12 @@ def weighed(starts: Starts) -> np.ndarray:
 
 
 def canonical(pose: np.ndarray, condition: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotate or mirror starts by a symmetry of the square pad. The push is then directed 0 to 45 degrees from +x.
+    """Rotate or mirror each start by a symmetry of the square pad, so that the push points 0 to 45 degrees from +x.
 
     The push is the acceleration of the object in the frame of the pad, opposite to the acceleration of the pad.
 
     Args:
-        pose: First poses, `(n, 7)`.
+        pose: Poses in the first frame, `(n, 7)`.
         condition: Conditions of `Perturbed`, `(n, 3)`. The first two columns are the acceleration of the pad (m/s^2).
             The third one is not used.
 
@@ -103,7 +104,9 @@ def tipping(rigid: np.ndarray, base: np.ndarray, push: np.ndarray, time: np.ndar
 def shaken(
     scenario: physics.Perturbed, items: list[objects.Body], starts: Starts, touch: np.ndarray | None
 ) -> np.ndarray:
-    """Features of lathed objects on the jerked pad.
+    """Compute features from which a classifier predicts the outcomes of starts on the jerked pad.
+
+    The objects must be solids of revolution, such as bottles.
 
     Args:
         scenario: The scenario.

@@ -78,7 +78,7 @@ class SeenController(EmulatedController):
 
 @dataclasses.dataclass(frozen=True)
 class Exposure:
-    """The exposure of one frame."""
+    """The start and end of the exposure of one frame, and the light during the exposure."""
 
     shares: list[float]  # successive shares of the light during the exposure, only one if the light was constant
     mean: float  # mean share over the exposure
@@ -188,7 +188,7 @@ class SensorPeer:
         self.lights.changed(protocol.DARK)
 
     def judged(self, image: Image, *, lit: bool) -> bool:
-        """Return True if all lights were on (`lit=True`) or off (`lit=False`) during the whole exposure of an image.
+        """Return whether the lights were at full power (`lit=True`) or off (`lit=False`) for the whole exposure.
 
         Return False for images that the camera did not take.
         """
@@ -201,7 +201,7 @@ class SensorPeer:
         self.leds.vanish()
 
     def shown(self) -> dict[int, Shown]:
-        """Return the light of each frame, by the `key` of its image."""
+        """Return the light of each frame by the frame's number, which `key` reads from an image."""
         return {number: Shown(number, exposure.mean) for number, exposure in self.camera.log.items()}
 
 

@@ -8,7 +8,7 @@ _TOLERANCE = 1e-3
 
 
 class Shown(NamedTuple):
-    """The light of one frame."""
+    """The number of a frame, and the mean light during its exposure."""
 
     number: int  # number of the frame
     light: float  # mean light during the exposure, as a share of the full power

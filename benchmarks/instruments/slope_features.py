@@ -1,7 +1,7 @@
-"""Features for a classifier of the outcome on the slope, from vision and from the centre of pressure.
+"""Features from which a classifier predicts the outcomes of objects on the slope (`physics.Inclined`).
 
-The features are results of statics: the support polygon of the object, and the place at which its weight acts. Downhill
-is +y.
+The features come from vision, and optionally from the measured centre of pressure. They are results of statics: the
+support polygon of the object, and the place at which its weight acts. Downhill is +y.
 """
 
 import math
@@ -127,12 +127,14 @@ def pressed(starts: Starts) -> np.ndarray:
 
 
 def laid(scenario: physics.Inclined, items: list[objects.Body], starts: Starts, touch: np.ndarray | None) -> np.ndarray:
-    """Features of starts on the slope, for objects of any shape.
+    """Compute features from which a classifier predicts the outcomes of starts on the slope.
 
-    The features include the mean results of `balance` for `DRAWS` random draws of the hidden contents. From vision
-    alone, all draws have equal weights. With touch, their weights are the likelihoods of the measured centre of
-    pressure. Noise with the standard deviations `SEEN` is added to the pose. An exact pose would reveal which objects
-    have already slipped by some micrometres.
+    The objects may have any shape. The features include the probabilities of tipping, sliding and sticking. A
+    probability is the weighted share of the predictions of `balance` for `DRAWS` random draws of the hidden contents,
+    each combined with `FRICTIONS` coefficients of friction. From vision alone, all predictions have equal weights. With
+    touch, the weight of a prediction is the likelihood of the measured centre of pressure. Noise with the standard
+    deviations `SEEN` is added to the pose. An exact pose would reveal which objects have already slipped by some
+    micrometres.
 
     Args:
         scenario: The scenario.

@@ -1,4 +1,4 @@
-"""Durations of function calls that are compared with each other."""
+"""Timing of several functions, to compare their durations."""
 
 import time
 from collections.abc import Callable
@@ -8,9 +8,10 @@ import numpy as np
 
 
 def in_turn(*calls: Callable[[], object], repeats: int = 5) -> np.ndarray:
-    """Measure functions in alternation, so that a busy machine slows all of them alike.
+    """Measure the durations of functions in alternation, so that a busy machine slows all of them alike.
 
-    Each function is called once before the measurement, which compiles it. A call ends when its arrays are ready.
+    Each function is called once before the measurement, so that its compilation is not measured. A call ends when
+    its arrays are ready.
 
     Args:
         calls: Functions without arguments.

@@ -1,4 +1,4 @@
-"""Depth images that embree traces, with which rendered depth is compared."""
+"""Reference depth images from the ray tracer Embree, with which rendered depth images are compared."""
 
 import jax
 import numpy as np
@@ -27,7 +27,7 @@ def body_mesh(body: objects.Body, pose: jax.Array) -> trimesh.Trimesh:
 def embree(
     mesh: trimesh.Trimesh, camera: sts.optics.Camera, shape: tuple[int, int], *, two_sided: bool = False
 ) -> np.ndarray:
-    """Trace the depth of the nearest triangle that faces the camera.
+    """Trace a depth image of the triangles that face the camera, with the ray tracer Embree.
 
     Args:
         mesh: The triangles in the sensor frame.
@@ -54,14 +54,14 @@ def embree(
 
 
 def interior(depth: np.ndarray, *, span: float = 1e-3) -> np.ndarray:
-    """Find the pixels whose 3x3 neighbourhood is hit everywhere and varies in depth by less than `span`.
+    """Find the pixels whose 3x3 neighbourhood has only finite depths, which differ by less than `span`.
 
     Args:
-        depth: Depth image (m), `(h, w)`, infinite where nothing is hit.
-        span: Limit for the difference of depths in the neighbourhood (m).
+        depth: Depth image (m), `(h, w)`, infinite where the ray of a pixel hits nothing.
+        span: Limit for the largest minus the smallest depth of the neighbourhood (m).
 
     Returns:
-        True for interior pixels, `(h, w)`.
+        True for interior pixels, `(h, w)`. Pixels at the edge of the image are not interior.
     """
     around = neighbours(np.where(np.isfinite(depth), depth, 1e9), 1e9)
     return (around.max(0) < 1e8) & (around.max(0) - around.min(0) < span)

@@ -1,4 +1,7 @@
-"""The digital twin in place of a real sensor, with the light of each frame from the twin's own log."""
+"""A digital twin that replaces a real sensor in a benchmark.
+
+The twin logs the light of each frame, so a benchmark can check the light of an image independently of `hardware.STS`.
+"""
 
 import math
 import zlib
@@ -18,9 +21,10 @@ _START = b"\xff\xd8\xff"  # first bytes of a JPEG image
 
 
 class TwinPeer:
-    """A digital twin with a camera at the address `url` and an LED controller at a port.
+    """A digital twin with a camera at the address `url` and an LED controller at a serial port.
 
-    Its log (`.jsonl`) and the record of its frames (`.mjpeg`) lie beside the link to the port.
+    The argument `path` is a symbolic link to the port. The twin writes its log and its frames to files whose names are
+    `path` with the suffixes `.jsonl` and `.mjpeg`.
     """
 
     def __init__(self, path: Path, *, fps: float, lag_s: float, exposure_s: float, size: tuple[int, int]) -> None:
@@ -63,12 +67,12 @@ class TwinPeer:
         self.twin.close()
 
     def shown(self) -> dict[int, Shown]:
-        """Return the light of each frame, by the `key` of its image."""
+        """Return the light of each frame by the frame's checksum, which `key` computes from an image."""
         _, *parts = self._record.read_bytes().split(_START)
         frames = zip(parts, twin.read_log(self._log), strict=True)
         return {key(photometry.decode(_START + part)): Shown(frame.index, frame.light) for part, frame in frames}
 
 
 def key(image: UInt8[np.ndarray, "height width 3"]) -> int:
-    """Checksum of an image's pixels. Frames differ in their noise, so their checksums differ too."""
+    """Compute the checksum of an image's pixels. Frames differ in their noise, so their checksums differ too."""
     return zlib.crc32(image.tobytes())

@@ -1,4 +1,4 @@
-"""Background images for a sensor file. Each background is the mean of many images of the empty pad in one stream."""
+"""Background images for a sensor file. Each is the mean of many visual or many tactile images of the empty pad."""
 
 import dataclasses
 import math
@@ -15,7 +15,7 @@ PAIRS = 20  # number of pairs whose mean is a background
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Backgrounds:
-    """The mean images of both streams of the empty pad."""
+    """The mean visual image and the mean tactile image of the empty pad."""
 
     visual: UInt8[np.ndarray, "height width 3"]  # mean image without light, RGB
     tactile: UInt8[np.ndarray, "height width 3"]  # mean image with light, RGB

@@ -52,7 +52,10 @@ def wait(text: str, every: float | None) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class Pictures:
-    """The pictures of a folder in the order of their names. In the first picture, the board lies on the pad."""
+    """The pictures of the calibration board in a folder, in the order of their names.
+
+    In the first picture, the board lies on the pad.
+    """
 
     folder: Path  # folder of the PNG files
     board: hardware.Board  # geometry of the printed board
@@ -81,8 +84,8 @@ class Pictures:
                 raise ValueError(f"{path} cannot be read ({error}): delete this picture, or take it again") from error
             if image.shape[1::-1] != size:
                 raise ValueError(
-                    f"{path} has {image.shape[1]} x {image.shape[0]} pixels, but the camera's size is {size[0]} x "
-                    f"{size[1]}: give the size of the pictures with --width and --height, or take the pictures again"
+                    f"{path} has {image.shape[1]} x {image.shape[0]} pixels, but --width is {size[0]} and --height is "
+                    f"{size[1]}: set these options to the size of the pictures, or take the pictures again"
                 )
             pictures = pictures.with_one(path.name, hardware.find_board(image, board))
         return pictures
@@ -99,9 +102,9 @@ class Pictures:
         return dataclasses.replace(self, names=names, found=(*there[:place], found, *there[place:]))
 
     def describe(self) -> str:
-        """Return a text about the parts of the image (`PARTS`) in which the board was found at least once.
+        """Return a text with the number of covered parts of the image (`PARTS`) and the names of the uncovered parts.
 
-        The text contains the number of these parts and the names of the other parts.
+        A part is covered if at least one picture shows a corner of the board in this part.
         """
         there = hardware.covered(self.found, self.size)
         missing = [part for part in PARTS if part not in there]
@@ -126,7 +129,7 @@ class Pictures:
         except hardware.CalibrationError as error:
             numbers = "" if not self.names else f" Image 0 is {self.names[0]}. Images are numbered in order of names."
             raise hardware.CalibrationError(
-                f"the pictures in {self.folder} do not determine the lens: {error}{numbers}"
+                f"the calibration with the pictures in {self.folder} failed: {error}{numbers}"
             ) from error
         return calibration
 

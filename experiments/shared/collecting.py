@@ -212,14 +212,14 @@ def person(config: Collect) -> Iterator[Person]:
 
 
 class AutomaticTerminal(AutomaticPerson):
-    """Confirms every trajectory automatically, and prints the instructions."""
+    """A `Person` that confirms every trajectory automatically and prints the instructions in the terminal."""
 
     def __init__(self, count: int | None):
         super().__init__()
         self._terminal = Terminal(count, keys=False)
 
     def show(self, view: View) -> None:
-        """Print the view if it has changed."""
+        """Print the instruction or the problem of a view, if these or the number of the trajectory have changed."""
         super().show(view)
         self._terminal.show(view)
 
@@ -232,10 +232,13 @@ class AutomaticPage(AutomaticPerson):
         self._page = page
 
     def show(self, view: View) -> None:
-        """Show the view."""
+        """Show the images and the instruction of a view in all open pages."""
         super().show(view)
         self._page.show(view)
 
     def action(self) -> hardware.Action | None:
-        """The action of a button that was pressed, or otherwise the automatic action."""
+        """Return the action of the button that was pressed last, or the automatic action if no button was pressed.
+
+        The automatic action is `Action.CONFIRM` in the stage `REVIEW`, and otherwise None.
+        """
         return self._page.action() or super().action()

@@ -4,7 +4,7 @@ import argparse
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 
@@ -86,7 +86,9 @@ def run(presets: Mapping[str, Config], workdir: str, description: str | None) ->
 
 
 def parse(presets: Mapping[str, Config], workdir: str, description: str | None) -> Args:
-    """Read the options of the command line. A field without an option keeps the value of the preset.
+    """Read the options of the command line.
+
+    Fields of the configuration whose options are not given keep the values of the preset.
 
     Args:
         presets: Configurations by name. The name `default` must be among them.
@@ -98,28 +100,12 @@ def parse(presets: Mapping[str, Config], workdir: str, description: str | None) 
     name = first.parse_known_args()[0].preset
     preset = presets.get(name, presets["default"])  # tyro reports an unknown name
     default = Args(Path(workdir), preset)
-    with _concrete():
-        args = tyro.cli(Args, default=default, description=description, config=(tyro.conf.AvoidSubcommands,))
+    args = tyro.cli(Args, default=default, description=description, config=(tyro.conf.AvoidSubcommands,))
     for model, field in (("paper", "training"), ("statespace", "state_training")):
         if args.config.model != model and getattr(args.config, field) != getattr(preset, field):
             option = f"--{field.replace('_', '-')}"
             say(f"note: {option}.* has no effect, because --model {args.config.model} is trained")
     return args
-
-
-def _concrete() -> tyro.constructors.ConstructorRegistry:
-    """A rule for tyro: if a field's type is a Protocol, its options are the fields of its default, a dataclass."""
-    registry = tyro.constructors.ConstructorRegistry()
-
-    @registry.struct_rule
-    def rule(info: tyro.constructors.StructTypeInfo) -> Any:
-        kind = type(info.default)
-        if not (getattr(info.type, "_is_protocol", False) and dataclasses.is_dataclass(kind)):
-            return None
-        concrete = tyro.constructors.StructTypeInfo.make(kind, info.default, in_union_context=False)
-        return tyro.constructors.ConstructorRegistry.get_struct_spec(concrete)
-
-    return registry
 
 
 def configure(args: Args) -> Config:
@@ -158,7 +144,10 @@ def with_meshes(
     scale: float | None = None,
     up: Literal["x", "y", "z"] | None = None,
 ) -> dataset.Collection:
-    """Replace the objects of a collection by the objects of a folder, and keep about the same number of trajectories.
+    """Replace the objects of a collection by the objects of a folder.
+
+    If the folder has fewer objects than the collection, each object gets more trajectories, so that the total number of
+    trajectories stays about the same. Otherwise the number of trajectories per object does not change.
 
     The objects are listed in `objects.txt` in the work directory.
 
@@ -200,8 +189,9 @@ def with_meshes(
     say(f"{len(meshes.names)} objects can be used. {path} lists these and the objects left out")
     if len(meshes.names) < LEAST_OBJECTS:
         raise ValueError(
-            f"--objects {folder} has {len(meshes.names)} usable objects, but the split into training, validation and "
-            f"test needs at least {LEAST_OBJECTS}: add objects. {path} lists the unusable objects and their problems"
+            f"the split into training, validation and test needs at least {LEAST_OBJECTS} usable objects, but "
+            f"--objects {folder} has {len(meshes.names)}: add objects. {path} lists the unusable objects and their "
+            "problems"
         )
     each, rendered = (
         max(count, round(collection.num_objects * count / len(meshes.names)))

@@ -72,7 +72,7 @@ STATE_TRAINING = TrainConfig(
 
 
 def smoke(default: Config) -> Config:
-    """Reduce a configuration to a short experiment for tests, which runs every stage."""
+    """Reduce a configuration to a short experiment that runs every stage, for tests."""
     collection = dataclasses.replace(
         default.collection,
         num_objects=16,
@@ -134,7 +134,7 @@ def paper(collection: dataset.Collection, *, num_objects: int, num_per_object: i
 
 
 def check(config: Config) -> None:
-    """Check the fields that later stages need, so that a mistake is found before the collection.
+    """Check the fields that later stages need, so that a mistake is found before the dataset is collected.
 
     Raises:
         ValueError: A field is out of range, or two fields contradict each other. The message names the remedy.
@@ -166,12 +166,26 @@ def check(config: Config) -> None:
         )
     if config.model == "paper" and config.steps is not None and len(config.steps) != len(names):
         raise ValueError(
-            f"steps must have {len(names)} numbers, one for each of {', '.join(names)}, got {config.steps}: give "
-            f"--steps with {len(names)} numbers, or --steps None to train each model for --training.epochs epochs"
+            f"steps must have {len(names)} numbers, got {config.steps}: give --steps with one number for each model "
+            f"({', '.join(names)}), or --steps None to train each model for --training.epochs epochs"
         )
+    trained, option = (
+        (config.state_training, "state_training") if config.model == "statespace" else (config.training, "training")
+    )
+    if trained.schedule == "cosine" and trained.steps is not None and trained.warmup >= trained.steps:
+        raise ValueError(
+            f"{option}.warmup must be smaller than {option}.steps ({trained.steps}), got {trained.warmup}: give "
+            f"--{option.replace('_', '-')}.warmup {trained.steps // 10}, for example"
+        )
+    for name in ("num_shown", "num_samples", "rerolls", "num_rerolled"):
+        if getattr(config, name) < 1:
+            raise ValueError(f"{name} must be >= 1, got {getattr(config, name)}")
     unknown = [split for split in config.splits if split not in SPLITS]
     if unknown or not config.splits:
-        raise ValueError(f"splits must be one or more of {', '.join(SPLITS)}, got {config.splits}")
+        raise ValueError(
+            f"splits must be one or more of {', '.join(SPLITS)}, got {config.splits}: give --splits "
+            f"{SPLITS[0]}, for example"
+        )
 
 
 def image_sizes(config: Config) -> tuple[int, ...]:

@@ -26,7 +26,7 @@ def draw(
     """Draw the main model's predictions from vision and from all inputs, and the calibration of outcome probabilities.
 
     If the model predicts samples of the pose, further figures show the predicted and the re-rolled positions at rest.
-    A re-roll is another simulation of the same start with newly drawn hidden properties.
+    A re-roll is another simulation of the same start, with newly drawn hidden properties such as friction.
 
     Args:
         config: Configuration of the experiment.

@@ -21,13 +21,13 @@ CORRECTABLE = (
 
 @contextlib.contextmanager
 def on_one_line(*, debug: bool = False) -> Iterator[None]:
-    """If the user can correct an error, print `error: ...` on one line, and exit with code 1.
+    """If the user can correct an error of the `with` block, print `error: ...` on one line, and exit with code 1.
 
     Args:
         debug: If True, raise all errors unchanged, so that Python prints their tracebacks.
 
     Raises:
-        SystemExit: An error of one of the types in CORRECTABLE occurred.
+        SystemExit: `debug` is False, and an error of one of the types in CORRECTABLE occurred.
     """
     try:
         yield

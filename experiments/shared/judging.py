@@ -23,9 +23,9 @@ MAIN_SUBSETS = (
 class SplitPairs(NamedTuple):
     """The first and last frames of a split.
 
-    The fields `given` and `test` contain the same held-out trajectories, as inputs and as targets. The images of
-    `validation` and `given` have the resolution of the models' inputs. The images of `train` and `test` have the
-    resolution `config.image_size`, in which predictions are scored.
+    The field `given` contains the held-out trajectories as inputs. The field `test` contains the same trajectories as
+    targets. The images of `validation` and `given` have the resolution of the models' inputs. The images of `train` and
+    `test` have the resolution `config.image_size`, in which predictions are scored.
     """
 
     train: dataset.Pairs  # training trajectories
@@ -160,7 +160,8 @@ def _scored(
 def main_rows(model: str, titles: Sequence[str]) -> list[str]:
     """Titles of the rows of the main table: ceiling, baselines, and the main model with up to five sets of inputs.
 
-    The ceiling is the score of the mean of repeated simulations with newly drawn hidden properties (re-rolls).
+    The ceiling is the score of the mean result of re-rolls. A re-roll is another simulation of the same start, with
+    newly drawn hidden properties such as friction.
 
     Args:
         model: Title of the main model.

@@ -64,7 +64,7 @@ class Backgrounds:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Views:
-    """The conversion from raw images to the view of the sensor."""
+    """The conversion from raw images to rectified images, which show the view of the sensor's pinhole camera."""
 
     lens: hardware.Lens  # lens of the raw images
     pinhole: hardware.Pinhole  # view of the sensor
@@ -101,7 +101,7 @@ class Views:
 
 
 class Live:
-    """Predicts in a thread, always from the newest images.
+    """Predicts the resting state in a background thread, always from the newest images.
 
     ```python
     with Live(predictor, views, names, (), show) as live:
@@ -140,8 +140,8 @@ class Live:
         width = predictor.model.config.condition
         if len(condition) not in (0, width):
             raise ValueError(
-                f"--condition has {len(condition)} numbers, but the model {predictor!r} needs {width}: change this "
-                "option, or leave it out"
+                f"the number of values of --condition must be {width}, got {len(condition)}: change this option, or "
+                f"leave it out. The model is {predictor!r}"
             )
         self._predictor, self._views, self._outcomes = predictor, views, outcomes
         self._condition = np.asarray(condition or (0.0,) * width, np.float32) if width else None
@@ -163,14 +163,14 @@ class Live:
         self._thread.start()
 
     def offer(self, visual: hardware.Shot, tactile: hardware.Shot) -> None:
-        """Predict from these images next, and skip images that were offered earlier and still wait.
+        """Pass images to the thread for its next prediction, in place of earlier images that it has not used yet.
 
         Args:
             visual: Newest visual image.
             tactile: Newest tactile image.
 
         Raises:
-            Exception: An earlier prediction failed. This error has ended the thread.
+            Exception: An earlier prediction raised this exception, which ended the thread.
         """
         with self._changed:
             if self._error is not None:

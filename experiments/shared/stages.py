@@ -206,11 +206,12 @@ def run(
 
 
 def calibrate(job: Job, model: statespace.Config, folder: Path, config: Config, validation: dataset.Pairs) -> None:
-    """Calibrate the probabilities of a trained state-space model.
+    """Calibrate a trained state-space model on the validation trajectories, and write `calibration.json`.
 
     Args:
-        job: Model and data of the training.
-        model: Configuration of the networks.
+        job: The training of the model, from `jobs`. Only its preprocessing and its images of the untouched sensor are
+            used.
+        model: Configuration of the networks, equal to `job.model`.
         folder: Folder of the trained model.
         config: Configuration of the experiment.
         validation: First and last frames of the validation trajectories.

@@ -20,7 +20,7 @@ FLOOR = "the truth itself (entropy)"
 
 
 def evaluate(config: Config, data: Recorded, workdir: Path, folder: Path) -> str:
-    """Score the models on the validation trajectories, and write and return the results.
+    """Score the models on the validation trajectories, write the results, and return the table.
 
     The results are `metrics.json`, `table.md` and `figures/`. `metrics.json` records the checksums of all inputs and
     results. While all checksums match, nothing is evaluated again.
@@ -80,7 +80,7 @@ def predictions(models: Mapping[str, Path], data: Recorded) -> dict[str, Predict
 
 
 def draw(config: Config, data: Recorded, predicted: Mapping[str, Predicted], path: Path) -> None:
-    """Draw the first validation trajectories: the two input images, and predicted and true images at rest."""
+    """Draw input images of the first validation trajectories, and predicted and true images of the object at rest."""
     held = data.validation
     labels = [f"#{number}" for number in held.number[: config.num_shown]]
 

@@ -37,12 +37,14 @@ class Train:
 
 
 def learn(args: Train) -> None:
-    """Collect trajectories of the twin if there are too few, train, evaluate, and print the table.
+    """Collect trajectories of the digital twin if there are too few, train, evaluate, and print the table.
 
-    If the trajectories in the work directory come from a device, no further trajectories are collected.
+    If the trajectories in the work directory come from a real sensor, or from a twin that `python -m experiments.twin`
+    ran as a separate program, no further trajectories are collected.
 
     Raises:
-        ValueError: An option is out of range, or the results were made with other options or trajectories.
+        ValueError: An option is out of range, there are too few trajectories, or the results were made with other
+            options or trajectories.
         FileNotFoundError: There is no sensor file, or a stage before `only` has not been run.
         LockedError: Another process works on the same results.
         OSError: A file is damaged or cannot be written.
@@ -72,9 +74,10 @@ def learn(args: Train) -> None:
 
 
 def collect(config: Config, workdir: Path) -> None:
-    """Collect the missing trajectories of the twin.
+    """Collect trajectories of the digital twin until the work directory has `config.count` trajectories.
 
-    If the trajectories in the work directory come from a device, no trajectories are collected.
+    If the trajectories in the work directory come from a real sensor, or from a twin that `python -m experiments.twin`
+    ran as a separate program, no trajectories are collected.
     """
     count = recorded.missing(config, workdir)
     if not count:
@@ -84,11 +87,11 @@ def collect(config: Config, workdir: Path) -> None:
 
 
 def plan(config: Config, missing: int) -> str:
-    """Run a small part of each stage with the twin, and estimate the duration of the whole experiment.
+    """Run a small part of each stage with the digital twin, and estimate the duration of the whole experiment.
 
     Args:
         config: Configuration of the experiment.
-        missing: Number of trajectories that the twin has to collect.
+        missing: Number of trajectories of the digital twin that must still be collected.
 
     Returns:
         A text with one line for each stage, and a line for the total duration.

@@ -13,10 +13,11 @@ KEYS = {"\n": Action.CONFIRM, "\r": Action.CONFIRM, "d": Action.DISCARD, "q": Ac
 
 
 class Terminal:
-    """Implements `hardware.Person` with a terminal: shows views to a person, and returns the person's actions.
+    """Implements `hardware.Person` with a terminal: prints the instructions, and reads the person's actions.
 
-    Enter confirms, d discards and q stops. If the standard input is not a terminal, each line acts like a key: an empty
-    line confirms, `d` discards and `q` stops. The end of the input has the same effect as `q`.
+    The key Enter confirms the current stage of the recording, d discards the current trajectory, and q ends the
+    collection. If the standard input is not a terminal, each line acts like a key, and an empty line acts like Enter.
+    The end of the input has the same effect as q.
     """
 
     def __init__(self, count: int | None = None, *, keys: bool = True):
@@ -33,9 +34,10 @@ class Terminal:
             say("Enter confirms, d discards, q stops")
 
     def show(self, view: View) -> None:
-        """Print the instruction or the problem of a view.
+        """Print `view.problem`, or `view.instruction` if there is no problem.
 
-        Nothing is printed if the instruction, the problem and the number of the trajectory are unchanged.
+        Nothing is printed if the instruction, the problem and the number of the trajectory are the same as in the
+        previous call.
         """
         self._stages = self._stages[1], view.stage
         shown = view.instruction, view.problem, view.number
@@ -45,10 +47,10 @@ class Terminal:
             say(f"[{view.confirmed}{self._goal}]{number} {view.problem or view.instruction}")
 
     def action(self) -> Action | None:
-        """The action of the next key, or None.
+        """Return the action of the next key that was pressed, or None if there is none.
 
-        Unknown keys are ignored. Enter and d are also ignored if they were pressed before the person saw the current
-        stage of the recording (`hardware.Stage`).
+        The method does not wait for a key. Unknown keys are ignored. Enter and d are also ignored if they were pressed
+        before the person saw the current stage of the recording (`hardware.Stage`).
         """
         while select.select([sys.stdin], [], [], 0)[0]:
             data = os.read(sys.stdin.fileno(), 1)

@@ -30,7 +30,8 @@ def predictions(config: Config, data: Recorded, workdir: Path) -> Predicted | No
         workdir: Work directory from which the trajectories were read.
 
     Returns:
-        The predictions, or None if the model's images do not fit `config.image_size`.
+        The predictions at `config.image_size`. None if the model predicts images of another size, or if the height of
+        its input images is not a multiple of `config.image_size`.
     """
     predictor = sts.Predictor.load(NAME)
     side, (height, _) = config.image_size, predictor.preprocessing.resolution

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -230,6 +231,22 @@ def rigid(
     return mass, com, inertia + steiner(shell, body.shell_com - com) + steiner(contents, middle - com)
 
 
+class _Liquid(NamedTuple):
+    """The interior of a mesh below a level, as f signed tetrahedra that share a corner."""
+
+    volumes: Float[Array, "f"]  # signed volume of each tetrahedron (m^3)
+    corners: Float[Array, "f 3 3"]  # vectors from the common corner to the other three corners (m)
+    reference: Float[Array, "3"]  # the common corner (m)
+    volume: Float[Array, ""]  # volume of the interior below the level (m^3)
+
+
+class _Bracket(NamedTuple):
+    """An interval of heights along `up` (m) that contains the level of the liquid."""
+
+    low: Array
+    high: Array
+
+
 def fill_moments(
     interior: Float[Array, "i 3 3"], fill: ScalarLike, up: Direction = (0.0, 0.0, 1.0)
 ) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3 3"]]:
@@ -256,13 +273,8 @@ def fill_moments(
     bottom, top = jnp.min(height), jnp.max(height)
     middle = (jnp.min(interior, axis=(0, 1)) + jnp.max(interior, axis=(0, 1))) / 2
 
-    def below(level: Float[Array, ""]) -> tuple[Array, Array, Array, Array]:
-        """Divide the interior below `level`, a height along `up` (m), into tetrahedra that share a corner.
-
-        Returns:
-            Signed volume of each tetrahedron, vectors from the common corner to the other three corners of each
-            tetrahedron, the common corner, and the volume of the interior below `level`.
-        """
+    def below(level: Float[Array, ""]) -> _Liquid:
+        """Divide the interior below `level`, a height along `up` (m), into tetrahedra that share a corner."""
         # A triangle with one corner below the level adds the piece at that corner. A triangle with two corners below
         # adds the whole triangle and subtracts the piece at the corner above.
         reference = middle + (level - middle @ up) * up
@@ -279,22 +291,22 @@ def fill_moments(
         corners = jnp.concatenate([interior - reference, corner])
         weight = jnp.concatenate([count >= 2, jnp.where(crosses, jnp.where(count == 1, 1, -1), 0)])
         volume = jnp.einsum("fi,fi->f", corners[:, 0], jnp.cross(corners[:, 1], corners[:, 2])) / 6
-        return weight * volume, corners, reference, jnp.sum(weight * volume)
+        return _Liquid(weight * volume, corners, reference, jnp.sum(weight * volume))
 
     share = jnp.clip(jnp.asarray(fill, interior.dtype), 0, 1)
-    target = share * below(top + (top - bottom))[-1]
+    target = share * below(top + (top - bottom)).volume
 
-    def halve(_: ScalarLike, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
-        low, high = bracket
-        level = (low + high) / 2
-        less = below(level)[-1] < jax.lax.stop_gradient(target)
-        return jnp.where(less, level, low), jnp.where(less, high, level)
+    def halve(_: ScalarLike, bracket: _Bracket) -> _Bracket:
+        level = (bracket.low + bracket.high) / 2
+        less = below(level).volume < jax.lax.stop_gradient(target)
+        return _Bracket(jnp.where(less, level, bracket.low), jnp.where(less, bracket.high, level))
 
-    low, high = jax.lax.fori_loop(0, LEVEL_STEPS, halve, jax.lax.stop_gradient((bottom, top)))
+    bracket = jax.lax.fori_loop(0, LEVEL_STEPS, halve, jax.lax.stop_gradient(_Bracket(bottom, top)))
+    middle_level = (bracket.low + bracket.high) / 2
     # A Newton step with a constant slope gives the level the derivative of the exact root.
-    found, slope = jax.value_and_grad(lambda level: below(level)[-1])((low + high) / 2)
+    found, slope = jax.value_and_grad(lambda level: below(level).volume)(middle_level)
     wide = slope > 0
-    level = (low + high) / 2 + jnp.where(wide, (target - found) / jnp.where(wide, slope, 1), 0)
+    level = middle_level + jnp.where(wide, (target - found) / jnp.where(wide, slope, 1), 0)
     # The level of a full body is above its top, so that rounding cannot exclude the highest corners.
     level = jnp.where(share < 1, level, top + (top - bottom))
     volumes, corners, reference, volume = below(level)

@@ -1,7 +1,12 @@
 """The options of a training run."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
+
+from sts_jax._ranges import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, check
+
+_NUMBER = NOT_NEGATIVE | {"whole": True}  # 0 or a larger whole number
+_DECAY = NOT_NEGATIVE | {"below": 1.0}
 
 
 @dataclass(frozen=True)
@@ -9,35 +14,43 @@ class TrainConfig:
     """Options of a training run.
 
     Raises:
-        ValueError: `checkpoint_every` is not a multiple of `log_every`, or `schedule` is unknown.
+        ValueError: A number is out of its range, `checkpoint_every` is not a multiple of `log_every`, or `schedule` is
+            unknown.
     """
 
-    steps: int | None = None  # number of gradient steps (None: the number that `epochs` needs)
-    epochs: int = 200  # passes over the training set, used if steps is None (paper: 200)
-    batch_size: int = 64  # samples in a batch (paper: 64)
+    # number of gradient steps (None: the number that `epochs` needs)
+    steps: int | None = field(default=None, metadata=COUNT)
+    epochs: int = field(default=200, metadata=COUNT)  # passes over the training set, used if steps is None (paper: 200)
+    batch_size: int = field(default=64, metadata=COUNT)  # samples in a batch (paper: 64)
     # State-space models only: number of views in a batch, which are first frames without a trajectory, if the training
     # set has any
-    views: int = 16
+    views: int = field(default=16, metadata=_NUMBER)
     # State-space models only: number of falls in a batch, which are trajectories without images, if the training set
     # has any
-    falls: int = 96
-    learning_rate: float = 1e-3  # learning rate of Adam (not in the paper)
+    falls: int = field(default=96, metadata=_NUMBER)
+    learning_rate: float = field(default=1e-3, metadata=POSITIVE)  # learning rate of Adam (not in the paper)
     schedule: Literal["constant", "cosine"] = "constant"  # course of the learning rate. cosine falls to 0 at the end
-    warmup: int = 0  # number of first steps over which the learning rate rises linearly from 0
-    b1: float = 0.9  # Adam's decay of the mean gradient
-    b2: float = 0.999  # Adam's decay of the mean squared gradient
-    epsilon: float = 1e-8  # Adam's epsilon, added to the root of the mean squared gradient
+    # number of first steps over which the learning rate rises linearly from 0
+    warmup: int = field(default=0, metadata=_NUMBER)
+    b1: float = field(default=0.9, metadata=_DECAY)  # Adam's decay of the mean gradient
+    b2: float = field(default=0.999, metadata=_DECAY)  # Adam's decay of the mean squared gradient
+    # Adam's epsilon, added to the root of the mean squared gradient
+    epsilon: float = field(default=1e-8, metadata=NOT_NEGATIVE)
     # Adam's epsilon for the encoders of an `mvae` model (nats). Adam takes steps of full length even where a small beta
     # makes the gradient of the divergence small, and the encoders then collapse during the warm-up of beta. With a
     # large epsilon, gradients far below it change the encoders little.
-    encoder_epsilon: float = 1.0
-    clip: float | None = None  # longer gradients are scaled down to this global norm (None: not clipped)
-    beta_warmup: float = 0.25  # share of the steps over which beta rises from 0 to 1 (paper: 50 of 200 epochs)
+    encoder_epsilon: float = field(default=1.0, metadata=NOT_NEGATIVE)
+    # longer gradients are scaled down to this global norm (None: not clipped)
+    clip: float | None = field(default=None, metadata=POSITIVE)
+    # share of the steps over which beta rises from 0 to 1 (paper: 50 of 200 epochs)
+    beta_warmup: float = field(default=0.25, metadata=SHARE)
     seed: int = 0  # seed of the initial parameters, of the order of the samples and of the noise
-    log_every: int = 10  # number of steps whose mean is one record of the training log
-    checkpoint_every: int = 200  # number of steps between two checkpoints, a multiple of log_every
+    log_every: int = field(default=10, metadata=COUNT)  # number of steps whose mean is one record of the training log
+    # number of steps between two checkpoints, a multiple of log_every
+    checkpoint_every: int = field(default=200, metadata=COUNT)
 
     def __post_init__(self) -> None:
+        check(self)
         if self.checkpoint_every % self.log_every:
             raise ValueError(
                 f"checkpoint_every must be a multiple of log_every ({self.log_every}), got {self.checkpoint_every}"

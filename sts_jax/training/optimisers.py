@@ -17,9 +17,16 @@ def optimiser(config: TrainConfig, total: int) -> optax.GradientTransformation:
 
     Returns:
         The optimiser, with the learning rate schedule and the gradient clipping that `config` sets.
+
+    Raises:
+        ValueError: The warm-up takes all steps of a cosine schedule.
     """
     rate: float | optax.Schedule = config.learning_rate
     if config.schedule == "cosine":
+        if config.warmup >= total:
+            raise ValueError(
+                f"warmup must be smaller than the number of steps of a cosine schedule ({total}), got {config.warmup}"
+            )
         rate = optax.cosine_decay_schedule(config.learning_rate, total - config.warmup)
     if config.warmup:
         rise = optax.linear_schedule(0.0, config.learning_rate, config.warmup)
