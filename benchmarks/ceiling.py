@@ -29,7 +29,7 @@ from tqdm import tqdm
 import sts_jax as sts
 from experiments import freefall, inclined, perturbed, released
 from experiments.shared import rerolls, stages
-from sts_jax import _files, dataset, evaluation
+from sts_jax import dataset, evaluation, storage
 
 CONFIGS = {
     "freefall": freefall.DEFAULT,
@@ -91,7 +91,7 @@ def main(args: Args) -> None:
     if args.workdir is None:  # save time: symmetric copies and whole films do not change the held-out list
         collection = dataclasses.replace(config.collection, symmetries=False, num_full=0)
         config = dataclasses.replace(config, collection=collection)
-    with tempfile.TemporaryDirectory() as temporary, _files.lock(args.workdir or Path(temporary)):
+    with tempfile.TemporaryDirectory() as temporary, storage.lock(args.workdir or Path(temporary)):
         folder = args.workdir or Path(temporary)
         stages.claim(config, folder)
         data = stages.collect(config, folder, sensor)

@@ -27,7 +27,7 @@ from jaxtyping import Array, Float
 import sts_jax as sts
 from experiments import freefall, inclined, perturbed
 from experiments.shared import command, stages
-from sts_jax import _files, dataset, evaluation, statespace, training
+from sts_jax import dataset, evaluation, statespace, storage, training
 
 EXPERIMENTS = {"freefall": freefall, "inclined": inclined, "perturbed": perturbed}
 BATCH, RATE, WARMUP = 32, 1e-3, 100
@@ -191,7 +191,7 @@ def main(args: Args) -> str:
     """Train the network on a run's training objects, and return the table of its errors on held-out objects."""
     sts.enable_compilation_cache()
     config, sensor = EXPERIMENTS[args.scenario].PRESETS[args.preset], sts.Sensor()
-    with _files.lock(args.workdir):
+    with storage.lock(args.workdir):
         stages.claim(config, args.workdir)
         data = stages.collect(config, args.workdir, sensor)
     rows, scenario = evaluation.rows_of(data, config.splits[0]), config.collection.scenario

@@ -34,7 +34,7 @@ import sts_jax as sts
 from experiments.shared import errors, output
 from experiments.shared.command import Folder
 from experiments.shared.progress import Bar
-from sts_jax import _files, hardware
+from sts_jax import hardware, storage
 from sts_jax.evaluation import gap
 from sts_jax.hardware import twin
 from sts_jax.hardware.twin import photometry
@@ -337,7 +337,7 @@ def main(args: Args) -> None:
         print(line, flush=True)
         lines.append(line)
     if args.out is not None:
-        _files.write_bytes(args.out, ("\n".join(lines) + "\n").encode())
+        storage.write_bytes(args.out, ("\n".join(lines) + "\n").encode())
 
 
 if __name__ == "__main__":

@@ -40,7 +40,7 @@ from jaxtyping import PRNGKeyArray
 from benchmarks import soak
 from benchmarks.instruments import classifier, cnn, jerk_features, slope_features
 from benchmarks.instruments.starts import Starts, bodies, draw, kept, roll
-from sts_jax import dataset, objects, physics
+from sts_jax import objects, physics, storage
 from sts_jax.evaluation import metrics
 
 Part = Literal["outcomes", "truth", "pictures", "fill"]
@@ -290,7 +290,7 @@ def begun(study: Study, args: Args) -> tuple[list[objects.Body], Starts]:
     again = 8 if args.again is None else args.again
     if args.keep is not None:
         made = {"scenario": repr(study.scenario), "objects": count, "num": args.num, "again": again}
-        dataset.claim(args.keep / f"{args.scenario}.json", made)
+        storage.claim(args.keep / f"{args.scenario}.json", made)
     items = bodies(study.categories, count)
     begin = functools.partial(roll, again=again, reroll=study.reroll)
     return items, kept(args.keep, args.scenario, lambda: begin(jax.random.key(0), items, study.scenario, args.num))

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 import tyro
 
-from sts_jax import _files
+from sts_jax import storage
 from sts_jax.hardware import Lit, Pair, Shot, recordings
 
 SIZES = ((640, 480), (1640, 1232))
@@ -61,7 +61,7 @@ def main(args: Args) -> None:
                     start = time.perf_counter()
                     files = recordings.encoded_pair(taken, None)
                     middle = time.perf_counter()
-                    _files.write_folder(Path(folder) / str(number), files)
+                    storage.write_folder(Path(folder) / str(number), files)
                     encoding.append(1e3 * (middle - start))
                     writing.append(1e3 * (time.perf_counter() - middle))
                     size = sum(map(len, files.values()))

@@ -25,7 +25,7 @@ from benchmarks.deterministic import EXPERIMENTS
 from experiments.shared import command, stages
 from experiments.shared.config import Config
 from experiments.shared.progress import say
-from sts_jax import _files, dataset, evaluation
+from sts_jax import dataset, evaluation, storage
 from sts_jax.evaluation.figures import Trained, scaling
 
 Part = TypeVar("Part", dataset.Pairs, dataset.Views, dataset.Ends)
@@ -87,8 +87,8 @@ def train(
     note, stamps = folder / "seconds.json", []
     if not note.exists():
         stages.run(job._replace(schedule=schedule), folder, config.targets, lambda *_: stamps.append(time.monotonic()))
-        _files.write_json(note, float(np.median(np.diff(stamps))) * steps)
-    return len(falls.object), _files.read_json(note, f"delete {folder}") / 60
+        storage.write_json(note, float(np.median(np.diff(stamps))) * steps)
+    return len(falls.object), storage.read_json(note, f"delete {folder}") / 60
 
 
 def best_possible(workdir: Path) -> float | None:
@@ -96,7 +96,7 @@ def best_possible(workdir: Path) -> float | None:
     path = workdir / "metrics.json"
     if not path.exists():
         return None
-    found = _files.read_json(path, f"delete {path} and evaluate again")["predictors"].get(evaluation.CEILING)
+    found = storage.read_json(path, f"delete {path} and evaluate again")["predictors"].get(evaluation.CEILING)
     return None if found is None else found["visual_skill"]["value"]
 
 
@@ -104,7 +104,7 @@ def main(args: Args) -> str:
     """Train and score every model, and return a table with a row for each model and subset of inputs."""
     sts.enable_compilation_cache()
     config = EXPERIMENTS[args.scenario].PRESETS[args.preset]
-    with _files.lock(args.workdir):
+    with storage.lock(args.workdir):
         stages.claim(config, args.workdir)
         data = stages.collect(config, args.workdir, sts.Sensor())
         sizes = dict.fromkeys([(share, max(args.steps)) for share in args.shares] + [(1.0, n) for n in args.steps])

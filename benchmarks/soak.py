@@ -28,7 +28,7 @@ import tyro
 from tqdm import tqdm
 
 from benchmarks.instruments.starts import Starts, bodies, rigid_of
-from sts_jax import dataset, geometry, objects, physics
+from sts_jax import geometry, objects, physics, storage
 from sts_jax.physics.scenario import G
 from sts_jax.physics.simulation import SUNK_LIMIT
 from sts_jax.sensor import Sensor
@@ -138,7 +138,7 @@ def claim(folder: Path, name: str, size: int) -> None:
         ValueError: The folder has blocks with other settings. The message names all settings that differ.
     """
     settings = {"scenario": repr(SCENARIOS[name]), "num": NUM, "block": size, "sunk_limit": SUNK_LIMIT}
-    dataset.claim(folder / f"{name}.json", settings)
+    storage.claim(folder / f"{name}.json", settings)
 
 
 def soaked(folder: Path, name: str) -> Starts:
@@ -210,7 +210,7 @@ def main(args: Args, folder: Path) -> None:
         for index in tqdm(range(args.first_block, -(-args.num // size)), unit="block", desc=name):
             path = folder / f"{name}-{index:04d}.npz"
             if not path.exists():
-                dataset.write_arrays(path, block(name, index, size))
+                storage.write_arrays(path, block(name, index, size))
             with np.load(path) as kept:
                 parts.append(dict(kept))
         wanted = args.num - args.first_block * size

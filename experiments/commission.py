@@ -25,7 +25,7 @@ import tyro
 import sts_jax as sts
 from experiments.shared import backgrounds, boards, errors, output
 from experiments.shared.command import Folder
-from sts_jax import _files, hardware
+from sts_jax import hardware, storage
 
 FRAME_SHARE = 0.9  # longest exposure as a share of the time between two frames
 DARK = (0, 0, 0, 0)  # LED levels of the visual stream
@@ -262,7 +262,7 @@ def claim_pictures(config: Config, camera: hardware.Camera) -> None:
         ValueError: The folder has pictures from another camera, of another size, or of a board with another `ruler`.
     """
     made = {"camera": camera.source, "width": config.width, "height": config.height, "ruler": config.ruler}
-    _files.claim(config.out / "board" / "camera.json", made)
+    storage.claim(config.out / "board" / "camera.json", made)
 
 
 def main(config: Config) -> None:

@@ -24,7 +24,7 @@ import tyro
 import sts_jax as sts
 from experiments.shared import errors, output
 from experiments.shared.command import Folder
-from sts_jax import _files, dataset, hardware
+from sts_jax import dataset, hardware, storage
 from sts_jax.evaluation import figures, gap
 
 STREAMS = ("visual", "tactile")
@@ -270,7 +270,7 @@ def main(config: Config) -> None:
     matched = config.match == "number"
     text = report(real, simulated, matched=matched)
     print(text)
-    _files.write_bytes(config.out / "gap.txt", f"{text}\n".encode())
+    storage.write_bytes(config.out / "gap.txt", f"{text}\n".encode())
     draw(config, real, simulated, matched=matched)
 
 

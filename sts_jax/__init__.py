@@ -1,6 +1,6 @@
 """The See-Through-your-Skin (STS) visuotactile sensor in JAX: simulation, rendering and learned prediction."""
 
-from sts_jax import dataset, evaluation, geometry, mvae, objects, optics, physics, tactile, training
+from sts_jax import dataset, evaluation, geometry, mvae, objects, optics, physics, storage, tactile, training
 from sts_jax.compilation import enable_compilation_cache
 from sts_jax.display import load, save, show
 from sts_jax.frame import Frame, expose, sense, touch
@@ -25,6 +25,7 @@ __all__ = [
     "save",
     "sense",
     "show",
+    "storage",
     "tactile",
     "touch",
     "training",

@@ -12,13 +12,13 @@ from jaxtyping import ArrayLike
 from matplotlib.figure import Figure
 from PIL import Image
 
-from sts_jax._files import DamagedFileError, write_bytes
 from sts_jax.evaluation.views import outside
 from sts_jax.frame import Frame
 from sts_jax.objects import Body
 from sts_jax.physics import Trajectory
 from sts_jax.prediction import Prediction
 from sts_jax.sensor import Sensor
+from sts_jax.storage import DamagedFileError, write_bytes
 
 _KINDS: dict[str, type] = {kind.__name__: kind for kind in (Frame, Body, Trajectory)}
 _INCH = 2.6  # height of a panel (inches)

@@ -12,7 +12,7 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, ArrayLike, Bool, PRNGKeyArray
 
-from sts_jax import _arguments, _files, mvae, statespace, training
+from sts_jax import _arguments, mvae, statespace, storage, training
 from sts_jax.prediction import Prediction, completed, flagged, predict, predict_samples
 
 MODALITIES = ("visual", "tactile", "pose")
@@ -130,7 +130,7 @@ class Predictor:
         settings = {**self.model.settings, "preprocessing": dataclasses.asdict(self.preprocessing)}
         params, stats = nnx.split_state(self.model.state, nnx.Param, nnx.BatchStat)
         training.save_blank(folder, *self._images)
-        _files.write_json(folder / "config.json", settings)
+        storage.write_json(folder / "config.json", settings)
         training.save(folder, training.Weights(params, stats, jnp.int32(self.model.step)), compact=compact)
         if self.model.calibration is not None:
             training.save_calibration(folder, self.model.calibration, self._inputs)

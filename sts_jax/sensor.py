@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from sts_jax._files import read_json, write_json
 from sts_jax._ranges import NOT_NEGATIVE, STATIC, limits
 from sts_jax.optics import Camera, Room
+from sts_jax.storage import read_json, write_json
 from sts_jax.tactile import Gel, Leds, Lights, Phong, Skin
 
 _LIGHTS: dict[str, type[Lights] | type[Leds]] = {"Lights": Lights, "Leds": Leds}  # by `lights.kind` in a file

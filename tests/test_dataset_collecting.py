@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import sts_jax as sts
-from sts_jax import _files, dataset, evaluation
+from sts_jax import dataset, evaluation, storage
 from sts_jax.dataset.symmetry import turn_wrench
 
 SMALL = dataset.Collection(
@@ -204,9 +204,9 @@ def swap(one, other):
 def test_swapped_shards_are_refused(copied, endings, message):
     for ending in endings:
         swap(*(copied / f"{name}{ending}" for name in SHARDS))
-    with pytest.raises(dataset.DamagedFileError, match=message):
+    with pytest.raises(storage.DamagedFileError, match=message):
         dataset.load(copied)
-    with pytest.raises(dataset.DamagedFileError, match=message):
+    with pytest.raises(storage.DamagedFileError, match=message):
         dataset.collect(SMALL, sts.Sensor(), copied)
 
 
@@ -214,12 +214,12 @@ def test_images_copied_over_others_and_a_flipped_bit_are_refused(copied):
     one, other = (copied / f"{name}.array_record" for name in SHARDS)
     whole = one.read_bytes()
     one.write_bytes(other.read_bytes())
-    with pytest.raises(dataset.DamagedFileError, match=r"00000.*is damaged or belongs to another shard"):
+    with pytest.raises(storage.DamagedFileError, match=r"00000.*is damaged or belongs to another shard"):
         dataset.load(copied)
     flipped = bytearray(whole)
     flipped[len(whole) // 2] ^= 4
     one.write_bytes(flipped)
-    with pytest.raises(dataset.DamagedFileError, match=r"00000.*is damaged or belongs to another shard"):
+    with pytest.raises(storage.DamagedFileError, match=r"00000.*is damaged or belongs to another shard"):
         dataset.load(copied)
     one.write_bytes(whole)
     assert dataset.load(copied).identity
@@ -245,7 +245,7 @@ def test_an_invalid_split_is_refused(copied, change, message):
     split = json.loads(path.read_text())
     change(split)
     path.write_text(json.dumps(split))
-    with pytest.raises(dataset.DamagedFileError, match=rf"split\.json.*{message}"):
+    with pytest.raises(storage.DamagedFileError, match=rf"split\.json.*{message}"):
         dataset.load(copied)
 
 
@@ -281,7 +281,7 @@ def test_a_description_that_was_changed_afterwards_is_named(copied):
     path.write_text(json.dumps(content, indent=7))  # the layout does not matter
     assert dataset.load(copied).collection == content
     path.write_text(json.dumps({**content, "resolution": [32, 64]}))
-    with pytest.raises(dataset.DamagedFileError, match=r"was made with a collection\.json that differs"):
+    with pytest.raises(storage.DamagedFileError, match=r"was made with a collection\.json that differs"):
         dataset.load(copied)
 
 
@@ -319,5 +319,5 @@ def test_the_identity_of_a_dataset_follows_from_its_files(folder, copied):
 
 
 def test_a_folder_that_another_process_collects_into_is_refused(copied):
-    with _files.lock(copied), pytest.raises(dataset.LockedError, match="copy is in use by process"):
+    with storage.lock(copied), pytest.raises(storage.LockedError, match="copy is in use by process"):
         dataset.collect(SMALL, sts.Sensor(), copied)

@@ -5,7 +5,7 @@ import resource
 import numpy as np
 import pytest
 
-from sts_jax import dataset
+from sts_jax import storage
 from sts_jax.dataset import records
 
 
@@ -34,14 +34,14 @@ def test_views_after_frames_are_read_in_the_given_order(tmp_path):
     records.write_images(path, [images, (views,)])
     back = records.read_views(path, np.array([7, 5]), resolution=(9, 7), total=8)
     np.testing.assert_array_equal(back, views[[2, 0]])
-    with pytest.raises(dataset.DamagedFileError, match=r"has 8 records instead of 5"):
+    with pytest.raises(storage.DamagedFileError, match=r"has 8 records instead of 5"):
         records.read_images(path, np.arange(5), resolution=(9, 7), total=5)
 
 
 def test_equal_frames_give_equal_bytes(tmp_path):
     for name in ("a", "b"):
         records.write_images(tmp_path / f"{name}.array_record", [some_images()])
-        records.write_arrays(tmp_path / f"{name}.npz", {"x": np.arange(3)})
+        storage.write_arrays(tmp_path / f"{name}.npz", {"x": np.arange(3)})
     for ending in ("array_record", "npz"):
         assert (tmp_path / f"a.{ending}").read_bytes() == (tmp_path / f"b.{ending}").read_bytes()
 
@@ -51,13 +51,13 @@ def test_a_truncated_file_is_named(tmp_path, keep):
     path = tmp_path / "a.array_record"
     records.write_images(path, [some_images(50)])
     path.write_bytes(path.read_bytes()[: int(keep * path.stat().st_size)])
-    with pytest.raises(dataset.DamagedFileError, match=r"a\.array_record"):
+    with pytest.raises(storage.DamagedFileError, match=r"a\.array_record"):
         records.read_images(path, np.arange(50), resolution=(9, 7), total=50)
     arrays = tmp_path / "a.npz"
-    records.write_arrays(arrays, {"x": np.arange(3000)})
+    storage.write_arrays(arrays, {"x": np.arange(3000)})
     arrays.write_bytes(arrays.read_bytes()[: int(keep * arrays.stat().st_size)])
-    with pytest.raises(dataset.DamagedFileError, match=r"a\.npz"):
-        records.read_arrays(arrays)
+    with pytest.raises(storage.DamagedFileError, match=r"a\.npz is damaged .*: delete it\."):
+        storage.read_arrays(arrays, "delete it")
 
 
 def test_a_missing_file_is_named(tmp_path):
@@ -79,7 +79,7 @@ def test_an_interruption_while_writing_leaves_no_file(tmp_path):
     ("name", "write"),
     [
         ("a.array_record", lambda path: records.write_images(path, [some_images(1000)])),
-        ("a.npz", lambda path: records.write_arrays(path, {"x": np.zeros(10_000)})),
+        ("a.npz", lambda path: storage.write_arrays(path, {"x": np.zeros(10_000)})),
     ],
 )
 def test_a_full_disk_is_named_and_leaves_no_file(tmp_path, name, write):
@@ -126,7 +126,7 @@ def test_images_of_another_shard_are_refused(tmp_path):
     one, other = shard(tmp_path, 0, seed=1), shard(tmp_path, 1, seed=2)
     assert one.stat().st_size == other.stat().st_size  # both hold noise of equal length
     one.write_bytes(other.read_bytes())
-    with pytest.raises(dataset.DamagedFileError, match=r"0\.array_record is damaged or belongs to another shard"):
+    with pytest.raises(storage.DamagedFileError, match=r"0\.array_record is damaged or belongs to another shard"):
         records.read_shard(one, records.Identity(COLLECTION, SENSOR, 0))
     assert records.read_shard(other, records.Identity(COLLECTION, SENSOR, 1))
 
@@ -136,7 +136,7 @@ def test_both_files_of_another_shard_are_refused(tmp_path):
     for ending in (".array_record", ".npz"):
         one.with_suffix(ending).write_bytes(other.with_suffix(ending).read_bytes())
     with pytest.raises(
-        dataset.DamagedFileError, match=r"0\.npz contains the data of shard 1 instead of shard 0: delete 0\.npz and"
+        storage.DamagedFileError, match=r"0\.npz contains the data of shard 1 instead of shard 0: delete 0\.npz and"
     ):
         records.read_shard(one, records.Identity(COLLECTION, SENSOR, 0))
 
@@ -144,7 +144,7 @@ def test_both_files_of_another_shard_are_refused(tmp_path):
 @pytest.mark.parametrize("changed", ["collection", "sensor"])
 def test_a_shard_of_another_collection_or_sensor_is_refused(tmp_path, changed):
     wanted = records.Identity(COLLECTION, SENSOR, 0)._replace(**{changed: "f" * 64})
-    with pytest.raises(dataset.DamagedFileError, match=rf"0\.npz was made with a {changed}\.json that differs"):
+    with pytest.raises(storage.DamagedFileError, match=rf"0\.npz was made with a {changed}\.json that differs"):
         records.read_shard(shard(tmp_path, 0), wanted)
 
 
@@ -162,7 +162,7 @@ def test_a_flipped_bit_is_found_or_changes_no_array(tmp_path):
             file.write_bytes(torn)
             try:
                 after = records.read_shard(path, identity)
-            except dataset.DamagedFileError:
+            except storage.DamagedFileError:
                 continue
             unnoticed += 1  # dates and the like in a zip's directory
             assert all(np.array_equal(after[name], before[name]) for name in records.ARRAYS)
@@ -173,10 +173,10 @@ def test_a_flipped_bit_is_found_or_changes_no_array(tmp_path):
 
 def test_a_missing_array_is_named(tmp_path):
     path = shard(tmp_path, 0)
-    arrays = records.read_arrays(path.with_suffix(".npz"))
+    arrays = storage.read_arrays(path.with_suffix(".npz"), "delete it")
     del arrays["trajectory/pose"]
-    records.write_arrays(path.with_suffix(".npz"), arrays)
-    with pytest.raises(dataset.DamagedFileError, match=r"0\.npz lacks the arrays trajectory/pose: delete"):
+    storage.write_arrays(path.with_suffix(".npz"), arrays)
+    with pytest.raises(storage.DamagedFileError, match=r"0\.npz lacks the arrays trajectory/pose: delete"):
         records.read_shard(path, records.Identity(COLLECTION, SENSOR, 0))
 
 

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 import sts_jax as sts
-from sts_jax._files import DamagedFileError
+from sts_jax.storage import DamagedFileError
 
 RNG = np.random.default_rng(0)
 FRAME = sts.Frame(

@@ -9,8 +9,8 @@ import trimesh
 
 import sts_jax as sts
 from experiments import freefall, inclined, perturbed, released
-from experiments.shared import command, config, errors, judging, pictures, results, stages
-from sts_jax import _files, compilation, dataset, physics, training
+from experiments.shared import command, config, errors, pictures, results, stages
+from sts_jax import compilation, dataset, physics, storage, training
 
 BOTTLES = ("bottle",)
 
@@ -263,7 +263,7 @@ def test_an_error_that_the_user_can_correct_is_one_line_unless_debug_is_set(tmp_
 
 
 def locked_twice(folder: Path) -> None:
-    with _files.lock(folder), _files.lock(folder):
+    with storage.lock(folder), storage.lock(folder):
         pass
 
 
@@ -295,7 +295,7 @@ def test_an_error_of_the_program_keeps_its_traceback(fault, kind):
 
 
 def test_a_second_run_in_a_work_directory_is_refused(tmp_path):
-    with _files.lock(tmp_path), pytest.raises(_files.LockedError, match="wait until that process has finished"):
+    with storage.lock(tmp_path), pytest.raises(storage.LockedError, match="wait until that process has finished"):
         stages.main(freefall.SMOKE, tmp_path)
     assert not (tmp_path / "config.json").exists()
 
@@ -303,16 +303,9 @@ def test_a_second_run_in_a_work_directory_is_refused(tmp_path):
 def test_a_second_run_keeps_the_listing_of_the_first(folder, tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "objects.txt").write_text("of the first\n")
-    with _files.lock(tmp_path / "run"), pytest.raises(_files.LockedError):
+    with storage.lock(tmp_path / "run"), pytest.raises(storage.LockedError):
         command.configure(command.Args(tmp_path / "run", freefall.SMOKE, objects=folder))
     assert (tmp_path / "run" / "objects.txt").read_text() == "of the first\n"
-
-
-def test_a_damaged_log_of_a_training_is_named(tmp_path):
-    (tmp_path / "metrics.jsonl").write_bytes(b'{"step": 1}\n{"st')
-    with pytest.raises(dataset.DamagedFileError, match=r"metrics\.jsonl is damaged .*delete .* and train again"):
-        judging.read_log(tmp_path)
-    assert judging.read_log(tmp_path / "none") == []
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from player import Player
 
 from benchmarks.instruments.camera_server import SIZE
 from benchmarks.instruments.sensor_peer import DARK, LIT, SensorPeer
-from sts_jax import _files, hardware
+from sts_jax import hardware, storage
 from sts_jax.hardware import Action, Stage
 from sts_jax.hardware.settling import Settling
 
@@ -87,13 +87,13 @@ def test_trajectories_are_collected_discarded_and_continued(peer, sensor, tmp_pa
 
 
 def test_collecting_goes_on_while_the_disk_is_slow(peer, sensor, tmp_path, monkeypatch):
-    write, reviewing = _files.write_folder, threading.Event()
+    write, reviewing = storage.write_folder, threading.Event()
 
     def slow(path, files):
         assert reviewing.wait(60)
         write(path, files)
 
-    monkeypatch.setattr(_files, "write_folder", slow)
+    monkeypatch.setattr(storage, "write_folder", slow)
     person = Playing(Player(peer))
     person.stop_after = lambda view: view.stage is Stage.REVIEW and reviewing.set()
     assert collect(sensor, tmp_path / "session", person, 1) == 1
@@ -122,14 +122,14 @@ def test_an_interruption_by_the_keyboard_keeps_what_was_confirmed(peer, sensor, 
 
 
 def test_a_full_disk_is_shown_before_the_next_trajectory(peer, sensor, tmp_path, monkeypatch):
-    write, full = _files.write_folder, threading.Event()
+    write, full = storage.write_folder, threading.Event()
 
     def write_folder(path, files):
         if full.is_set():
             raise OSError(errno.ENOSPC, "No space left on device")
         write(path, files)
 
-    monkeypatch.setattr(_files, "write_folder", write_folder)
+    monkeypatch.setattr(storage, "write_folder", write_folder)
     full.set()
     person = Playing(Player(peer))
     problems = []

@@ -287,5 +287,5 @@ def test_the_lens_and_its_file_import_no_jax():
     folder = Path(hardware.__file__).parent
     for name in ("lens.py", "calibration.py", "sensor_file.py"):
         text = (folder / name).read_text()
-        allowed = r"^\s*(import|from) (jax|sts_jax(?!\.hardware|\._files| import _files$))"
+        allowed = r"^\s*(import|from) (jax|sts_jax(?!\.hardware|\.storage| import storage$))"
         assert not re.search(allowed, text, re.MULTILINE), name

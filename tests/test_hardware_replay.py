@@ -16,7 +16,7 @@ from test_experiments_real import sensor_file
 
 from benchmarks.instruments.sensor_peer import SensorPeer
 from sts_jax import hardware
-from sts_jax._files import DamagedFileError
+from sts_jax.storage import DamagedFileError
 
 FAST = 50.0  # recorded seconds in a second
 

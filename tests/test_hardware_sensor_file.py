@@ -95,7 +95,7 @@ def test_an_interrupted_write_leaves_the_earlier_file(tmp_path, monkeypatch):
     def full(path, content):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("sts_jax._files.write_json", full)
+    monkeypatch.setattr("sts_jax.storage.write_json", full)
     with pytest.raises(OSError, match="No space left"):
         dataclasses.replace(written, fps=60.0).save(tmp_path, sts.Sensor().constants())
     assert Device.load(tmp_path) == written

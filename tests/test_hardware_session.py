@@ -17,7 +17,7 @@ import session_writer
 from led_simulator import until
 from session_writer import ORIGIN, pair
 
-from sts_jax import _files, hardware
+from sts_jax import hardware, storage
 from sts_jax.hardware import recordings
 from sts_jax.hardware.session import Session, SessionError
 from sts_jax.hardware.settling import Settling
@@ -109,9 +109,9 @@ def test_discarding_and_restoring(tmp_path):
 def test_reviewing_waits_for_the_end_of_collecting(tmp_path):
     with Session.open(tmp_path, ORIGIN) as session:
         add(session)
-        with pytest.raises(_files.LockedError, match="is in use by"):
+        with pytest.raises(storage.LockedError, match="is in use by"):
             hardware.discard_recording(tmp_path, 0)
-        with pytest.raises(_files.LockedError, match="is in use by"):
+        with pytest.raises(storage.LockedError, match="is in use by"):
             Session.open(tmp_path, ORIGIN)
 
 
@@ -145,7 +145,7 @@ def test_damage_is_named_with_the_remedy(tmp_path, name, damage):
     else:
         path.write_bytes(damage(path.read_bytes()))
     read = hardware.load_recordings(tmp_path)
-    with pytest.raises(_files.DamagedFileError, match=rf"{path.name}.*discard trajectory 0"):
+    with pytest.raises(storage.DamagedFileError, match=rf"{path.name}.*discard trajectory 0"):
         read[0]
     assert read[1].number == 1
     hardware.discard_recording(tmp_path, 0)
@@ -161,7 +161,7 @@ def test_folders_that_are_no_session_are_named(tmp_path):
 
 
 def test_a_full_disk_loses_nothing_and_is_reported_before_the_next_trajectory(tmp_path, monkeypatch):
-    write, full = _files.write_folder, []
+    write, full = storage.write_folder, []
 
     def write_folder(path, files):
         if full:
@@ -169,7 +169,7 @@ def test_a_full_disk_loses_nothing_and_is_reported_before_the_next_trajectory(tm
             raise OSError(errno.ENOSPC, "No space left on device")
         write(path, files)
 
-    monkeypatch.setattr(_files, "write_folder", write_folder)
+    monkeypatch.setattr(storage, "write_folder", write_folder)
     with Session.open(tmp_path, ORIGIN) as session:
         add(session)
         full.append(True)
@@ -198,7 +198,7 @@ def test_closing_with_a_full_disk_names_what_is_lost(tmp_path, monkeypatch):
 
     session = Session.open(tmp_path, ORIGIN)
     add(session)
-    monkeypatch.setattr(_files, "write_folder", full)
+    monkeypatch.setattr(storage, "write_folder", full)
     session.save(1, "initial", pair(1, "initial"))
     with pytest.raises(SessionError, match=r"the initial pair of trajectory 1\. They are lost .*No space left"):
         session.close(0.1)
@@ -215,8 +215,8 @@ def test_too_many_waiting_pairs_are_refused_and_too_little_space_is_named(tmp_pa
     def slow(path, files):
         until(lambda: release)
 
-    monkeypatch.setattr(_files, "write_folder", slow)
-    monkeypatch.setattr(_files, "flush_folder", lambda path: None)
+    monkeypatch.setattr(storage, "write_folder", slow)
+    monkeypatch.setattr(storage, "flush_folder", lambda path: None)
     with Session.open(tmp_path, ORIGIN) as session:
         for number in range(6):
             session.save(number, "initial", pair(number, "initial"))

@@ -12,7 +12,7 @@ from scipy import special
 from statespace_config import STATE, random_codes, random_states, state_model
 
 import sts_jax as sts
-from sts_jax import _files, evaluation, mvae, statespace, training
+from sts_jax import evaluation, mvae, statespace, storage, training
 from sts_jax.statespace import calibration, fitting, networks, poses, predict
 
 NUMBER = 40
@@ -212,7 +212,7 @@ def test_older_calibration_has_the_default_contrast(calibrated):
     for row in content["subsets"].values():
         del row["contrast"]
     del content["checksum"]
-    path.write_text(json.dumps({**content, "checksum": _files.digest(content)}))
+    path.write_text(json.dumps({**content, "checksum": storage.digest(content)}))
     np.testing.assert_array_equal(training.load(calibrated).calibration.contrast, networks.CONTRAST)
 
 
@@ -240,7 +240,7 @@ def test_damaged_calibration_is_named(calibrated):
     whole = path.read_text()
     for damaged in (whole[:-30], whole.replace('"variance": ', '"variance": 1', 1), "[]"):
         path.write_text(damaged)
-        with pytest.raises(_files.DamagedFileError, match=r"calibration\.json.*calibrate again"):
+        with pytest.raises(storage.DamagedFileError, match=r"calibration\.json.*calibrate again"):
             training.load(calibrated)
     path.unlink()
     assert training.load(calibrated).calibration is None

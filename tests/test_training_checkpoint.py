@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from sts_jax import _files, mvae, training
+from sts_jax import mvae, storage, training
 from sts_jax.training import checkpoint, manifest, optimisers
 
 SMALL = mvae.Config((mvae.Modality("a", "vector", (3,)), mvae.Modality("b", "vector", (2,))), latent=4, hidden=8)
@@ -74,7 +74,7 @@ def test_every_single_bit_flip_is_found_and_named(folder):
         flipped = bytearray(whole)
         flipped[rng.integers(len(whole))] ^= 1 << rng.integers(8)
         path.write_bytes(flipped)
-        with pytest.raises(_files.DamagedFileError, match=f"{name}.*train again"):
+        with pytest.raises(storage.DamagedFileError, match=f"{name}.*train again"):
             checkpoint.verified(folder)
         path.write_bytes(whole)
     assert checkpoint.verified(folder) == folder / "checkpoints/00000004"
@@ -89,11 +89,11 @@ def test_every_flip_in_the_manifest_is_found(folder):
         path.write_bytes(flipped)
         try:
             found = manifest.read(folder)
-        except _files.DamagedFileError:
+        except storage.DamagedFileError:
             continue
         if found == manifest.Manifest(4, json.loads(whole)["files"]):  # a flip in white space
             continue
-        with pytest.raises(_files.DamagedFileError, match="train again"):
+        with pytest.raises(storage.DamagedFileError, match="train again"):
             checkpoint.verified(folder)
 
 
@@ -113,7 +113,7 @@ def test_every_flip_in_the_manifest_is_found(folder):
 )
 def test_each_mismatch_with_the_manifest_is_named(folder, damage, message):
     damage(folder)
-    with pytest.raises(_files.DamagedFileError, match=message) as caught:
+    with pytest.raises(storage.DamagedFileError, match=message) as caught:
         training.load(folder)
     assert "train again" in str(caught.value)
 
@@ -128,7 +128,7 @@ def test_a_torn_checkpoint_gives_one_short_message(folder, capfd, caplog):
     for path in (folder / "checkpoints").rglob("*"):
         if path.is_file():
             path.write_bytes(path.read_bytes()[:200])
-    with pytest.raises(_files.DamagedFileError, match="its SHA-256 differs") as caught:
+    with pytest.raises(storage.DamagedFileError, match="its SHA-256 differs") as caught:
         training.load(folder)
     out = capfd.readouterr()
     assert out.out + out.err + caplog.text == ""
@@ -233,7 +233,7 @@ def test_every_error_of_orbax_becomes_an_os_error(tmp_path, state, monkeypatch, 
 
 def test_a_second_training_in_a_folder_is_refused(tmp_path):
     def again(done, total, record):
-        with pytest.raises(_files.LockedError, match=f"{tmp_path} is in use by process"):
+        with pytest.raises(storage.LockedError, match=f"{tmp_path} is in use by process"):
             train(tmp_path)
         raise Killed
 
@@ -269,7 +269,7 @@ def test_a_blank_written_after_the_training_is_listed(tmp_path):
 @pytest.mark.parametrize("content", [b"", b"PK", b"no zip", b"\x80\x81"])
 def test_a_damaged_blank_is_named(tmp_path, content):
     (tmp_path / "blank.npz").write_bytes(content)
-    with pytest.raises(_files.DamagedFileError, match=r"blank\.npz is damaged.*delete it"):
+    with pytest.raises(storage.DamagedFileError, match=r"blank\.npz is damaged.*delete it"):
         training.load_blank(tmp_path)
 
 
@@ -282,7 +282,7 @@ def test_a_missing_or_incomplete_blank_is_named(tmp_path):
         {"visual": IMAGE, "tactile": IMAGE[0]},
     ):
         np.savez(tmp_path / "blank.npz", **content)
-        with pytest.raises(_files.DamagedFileError, match=r"blank\.npz is damaged"):
+        with pytest.raises(storage.DamagedFileError, match=r"blank\.npz is damaged"):
             training.load_blank(tmp_path)
 
 
@@ -307,7 +307,7 @@ def test_a_damaged_record_is_named_and_a_torn_last_one_is_dropped(tmp_path, fini
     log = workdir / "metrics.jsonl"
     first, second = log.read_bytes().splitlines()
     log.write_bytes(b"\n".join([first, line, second, b""]))
-    with pytest.raises(_files.DamagedFileError, match=r"metrics\.jsonl, line 2, is damaged.*delete this line"):
+    with pytest.raises(storage.DamagedFileError, match=r"metrics\.jsonl, line 2, is damaged.*delete this line"):
         train(workdir)
     log.write_bytes(b"\n".join([first, second, line]))
     train(workdir)

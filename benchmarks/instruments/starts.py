@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 from tqdm import tqdm
 
-from sts_jax import dataset, objects, physics
+from sts_jax import dataset, objects, physics, storage
 from sts_jax.sensor import Sensor
 
 # Mass, centre of mass and inertia of one body for several fills, shell scales and directions of the contents.
@@ -165,5 +165,5 @@ def kept(folder: Path | None, name: str, make: Callable[[], Starts]) -> Starts:
             return Starts(**{field: file[field] for field in Starts._fields})
     starts = make()
     if path is not None:
-        dataset.write_arrays(path, starts._asdict())
+        storage.write_arrays(path, starts._asdict())
     return starts

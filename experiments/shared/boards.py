@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, UnidentifiedImageError
 
-from sts_jax import _files, hardware
+from sts_jax import hardware, storage
 from sts_jax.hardware.calibration import FEWEST_CORNERS, FEWEST_IMAGES
 from sts_jax.hardware.coverage import PARTS
 
@@ -194,4 +194,4 @@ def _picture(
 def _write(path: Path, image: UInt8[np.ndarray, "height width 3"]) -> None:
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, "PNG", compress_level=3)
-    _files.write_bytes(path, buffer.getvalue())
+    storage.write_bytes(path, buffer.getvalue())

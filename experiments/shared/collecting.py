@@ -10,7 +10,7 @@ from experiments.shared.command import Folder
 from experiments.shared.page import Page
 from experiments.shared.progress import say
 from experiments.shared.terminal import Terminal, single_keys
-from sts_jax import _files, hardware
+from sts_jax import hardware, storage
 from sts_jax.hardware import AutomaticPerson, EmptyPad, GuideConfig, Person, View
 
 
@@ -182,8 +182,8 @@ def keep(file: Path, workdir: Path) -> None:
         return
     for background in (device.background_visual, device.background_tactile):
         if background is not None:
-            _files.write_bytes(workdir / background.name, file.with_name(background.name).read_bytes())
-    _files.write_bytes(copy, file.read_bytes())
+            storage.write_bytes(workdir / background.name, file.with_name(background.name).read_bytes())
+    storage.write_bytes(copy, file.read_bytes())
 
 
 @contextlib.contextmanager

@@ -13,7 +13,7 @@ from experiments.shared import errors, stages
 from experiments.shared.config import Config, check
 from experiments.shared.duration import plan
 from experiments.shared.progress import say
-from sts_jax import _files, dataset
+from sts_jax import dataset, storage
 from sts_jax.compilation import cache_folder
 
 LEAST_OBJECTS = 10  # smallest number of usable objects in a folder, so that some can be used for validation and test
@@ -169,7 +169,7 @@ def with_meshes(
     taken = classes or tuple(name for name in there if name in collection.categories) or there
     others = [name for name in there if name not in taken]
     path = workdir / "objects.txt"
-    with _files.lock(workdir):  # so that another run in this folder does not lose its listing
+    with storage.lock(workdir):  # so that another run in this folder does not lose its listing
         meshes, listing = dataset.survey_meshes(
             folder,
             collection.scenario,
@@ -184,7 +184,7 @@ def with_meshes(
             listing += f"classes left out: {', '.join(others)}; --classes takes others\n"
         # The stage `collect` appends the objects that it left out, so the file may be longer than this listing.
         if not (path.exists() and path.read_text(errors="replace").startswith(listing)):
-            _files.write_bytes(path, listing.encode())
+            storage.write_bytes(path, listing.encode())
     say(f"classes used: {', '.join(taken)}" + (f". Left out: {', '.join(others)}" if others else ""))
     say(f"{len(meshes.names)} objects can be used. {path} lists these and the objects left out")
     if len(meshes.names) < LEAST_OBJECTS:

@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Iterator
 
 from sts_jax import hardware
-from sts_jax.dataset import LockedError
+from sts_jax.storage import LockedError
 
 # Types of the errors that the library raises for mistakes that the user can correct
 CORRECTABLE = (

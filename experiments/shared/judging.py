@@ -1,7 +1,6 @@
 """Evaluates every model of an experiment with every subset of its inputs, and writes tables and figures."""
 
 import dataclasses
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -11,7 +10,8 @@ from experiments.shared import drawing, pictures, results
 from experiments.shared.config import MODELS, TITLES, Config, main_model, model_folder, schedule
 from experiments.shared.progress import Bar, say
 from experiments.shared.rerolls import ceilings
-from sts_jax import _files, dataset, evaluation, training
+from sts_jax import dataset, evaluation, storage, training
+from sts_jax.training import records
 
 # The main table has rows for the main model with the first five of these inputs that the model supports.
 MAIN_SUBSETS = (
@@ -72,7 +72,8 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
         summary = evaluation.summarise(scores, test, outcomes=scenario.outcomes)
         bar("evaluate", len(own), len(own), "intervals done")
 
-    logs = {TITLES[name]: read_log(model_folder(workdir, name, config, split)) for name in MODELS[config.model]}
+    folders = {TITLES[name]: model_folder(workdir, name, config, split) for name in MODELS[config.model]}
+    logs = {title: records.read(folder / records.NAME) for title, folder in folders.items()}
     drawn = drawing.draw(config, workdir, figures, sensor, test, scores, shown, possible)
     drawn.append(figures / "training.png")
     evaluation.figures.training_curves(drawn[-1], logs)
@@ -86,15 +87,15 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
     )
     notes += _gains(TITLES[main_model(config)], scores, test)
     text = evaluation.table(summary, title=title, rows=main_rows(TITLES[main_model(config)], list(shown)), notes=notes)
-    _files.write_bytes(table, text.encode())
-    _files.write_bytes(complete, evaluation.full_table(summary, title=title, notes=notes).encode())
+    storage.write_bytes(table, text.encode())
+    storage.write_bytes(complete, evaluation.full_table(summary, title=title, notes=notes).encode())
     results.write(done, {"split": split, **summary}, inputs, [table, complete, *drawn])
     return text
 
 
 def _inputs(config: Config, data: dataset.Dataset, workdir: Path, split: str) -> dict[str, str]:
     """The checksums of the configuration, the dataset and the models, by name."""
-    inputs = {"config.json": _files.digest(dataclasses.asdict(config)), "dataset": data.identity}
+    inputs = {"config.json": storage.digest(dataclasses.asdict(config)), "dataset": data.identity}
     for folder in (model_folder(workdir, name, config, split) for name in MODELS[config.model]):
         inputs[folder.relative_to(workdir).as_posix()] = results.identity(folder)
     return inputs
@@ -194,20 +195,3 @@ def _gains(model: str, scores: Mapping[str, evaluation.Scores], test: dataset.Pa
         return []
     value, low, high = (found[key] for key in ("value", "low", "high"))
     return [f"Touch removes {value:.3f} [{low:.3f}, {high:.3f}] of the outcome's log loss from vision."]
-
-
-def read_log(folder: Path) -> list[dict[str, float]]:
-    """Read the training log of a model. Without a log, the list is empty.
-
-    Raises:
-        DamagedFileError: The log is damaged.
-    """
-    path = folder / "metrics.jsonl"
-    try:
-        return [json.loads(line) for line in path.read_bytes().splitlines()]
-    except FileNotFoundError:
-        return []
-    except ValueError as error:  # invalid UTF-8 or no JSON
-        raise dataset.DamagedFileError(
-            f"the training log {path} is damaged ({error}): delete {folder}, and train again"
-        ) from error

@@ -11,7 +11,7 @@ import sts_jax as sts
 from experiments.shared import stages
 from experiments.shared.config import MODELS
 from experiments.shared.progress import Bar
-from sts_jax import _files, hardware, training
+from sts_jax import hardware, storage, training
 from sts_jax.hardware import twin
 from sts_jax.training import TrainConfig
 
@@ -174,7 +174,7 @@ def identity(workdir: Path, recordings: hardware.Recordings) -> str:
 
     The sensor file contains the checksums of the background images.
     """
-    return _files.digest({"dataset": recordings.identity, "sensor": _files.sha256(workdir / "sensor.json")})
+    return storage.digest({"dataset": recordings.identity, "sensor": storage.sha256(workdir / "sensor.json")})
 
 
 def jobs(config: Config, data: Recorded) -> Iterator[stages.Job]:

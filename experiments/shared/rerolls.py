@@ -13,8 +13,7 @@ import numpy as np
 import sts_jax as sts
 from experiments.shared import results
 from experiments.shared.progress import Bar, say
-from sts_jax import _files, dataset, evaluation
-from sts_jax.dataset.records import read_arrays
+from sts_jax import dataset, evaluation, storage
 
 Judge = Callable[[evaluation.Predicted, dataset.Pairs], evaluation.Scores]
 SEED = 20  # seed of the re-rolls
@@ -62,8 +61,8 @@ def ceilings(
     record, path = workdir / f"ceiling{suffix}.json", workdir / f"ceiling{suffix}.npz"
     inputs = {
         "dataset": data.identity,
-        "the held-out list": _files.digest(few.trajectory.tolist()),
-        "the re-rolls": _files.digest([times, SEED, FORMAT]),
+        "the held-out list": storage.digest(few.trajectory.tolist()),
+        "the re-rolls": storage.digest([times, SEED, FORMAT]),
     }
     reason = results.stale(record, inputs)
     if reason is not None:
@@ -72,9 +71,9 @@ def ceilings(
         with Bar() as bar:
             total = times * len(few.object)
             made = reroll(collection, sensor, few, times, judge, lambda done: bar("re-roll", done, total))
-        dataset.write_arrays(path, _flat(made))
+        storage.write_arrays(path, _flat(made))
         results.write(record, {"times": times, "items": len(few.object)}, inputs, [path])
-    return _restored(read_arrays(path))
+    return _restored(storage.read_arrays(path, f"delete {path.name} and {record.name}, and evaluate again"))
 
 
 def reroll(

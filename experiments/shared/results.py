@@ -4,13 +4,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sts_jax import _files
+from sts_jax import storage
 
 
 def identity(folder: Path) -> str:
     """The SHA-256 checksum of the names and contents of all files in a model's folder, except hidden files."""
     files = (path for path in folder.rglob("*") if path.is_file() and not path.name.startswith("."))
-    return _files.digest({path.relative_to(folder).as_posix(): _files.sha256(path) for path in files})
+    return storage.digest({path.relative_to(folder).as_posix(): storage.sha256(path) for path in files})
 
 
 def write(path: Path, content: Mapping[str, Any], inputs: Mapping[str, str], outputs: Sequence[Path]) -> None:
@@ -27,9 +27,9 @@ def write(path: Path, content: Mapping[str, Any], inputs: Mapping[str, str], out
     record = {
         **content,
         "inputs": dict(inputs),
-        "outputs": {file.relative_to(path.parent).as_posix(): _files.sha256(file) for file in outputs},
+        "outputs": {file.relative_to(path.parent).as_posix(): storage.sha256(file) for file in outputs},
     }
-    _files.write_json(path, {**record, "checksum": _files.digest(record)})
+    storage.write_json(path, {**record, "checksum": storage.digest(record)})
 
 
 def stale(path: Path, inputs: Mapping[str, str]) -> str | None:
@@ -43,20 +43,20 @@ def stale(path: Path, inputs: Mapping[str, str]) -> str | None:
         The reason for a new computation, or None if the results are up to date.
     """
     try:
-        record = _files.read_json(path, "it will be written again")
+        record = storage.read_json(path, "it will be written again")
     except FileNotFoundError:
         return f"{path.name} is missing"
-    except _files.DamagedFileError:
+    except storage.DamagedFileError:
         return f"{path.name} is damaged"
     if not isinstance(record, dict) or "checksum" not in record:
         return f"{path.name} has no record of its inputs"
-    if record.pop("checksum") != _files.digest(record):
+    if record.pop("checksum") != storage.digest(record):
         return f"{path.name} was changed"
     for name in {**record["inputs"], **inputs}:
         if record["inputs"].get(name) != inputs.get(name):
             return f"{name} has changed since"
     for name, checksum in record["outputs"].items():
         file = path.parent / name
-        if not file.is_file() or _files.sha256(file) != checksum:
+        if not file.is_file() or storage.sha256(file) != checksum:
             return f"{name} is missing or was changed"
     return None

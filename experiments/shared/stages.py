@@ -11,7 +11,7 @@ import sts_jax as sts
 from experiments.shared.config import MODELS, Config, check, model_folder
 from experiments.shared.judging import evaluate
 from experiments.shared.progress import Bar, say
-from sts_jax import _files, dataset, evaluation, mvae, statespace, training
+from sts_jax import dataset, evaluation, mvae, statespace, storage, training
 from sts_jax.training import TrainConfig
 
 Stage = Literal["collect", "train", "evaluate"]
@@ -32,7 +32,7 @@ def main(config: Config, workdir: Path, *, only: Stage | None = None) -> None:
     """
     check(config)
     sensor = sts.Sensor()
-    with _files.lock(workdir):
+    with storage.lock(workdir):
         claim(config, workdir)
         data = collect(config, workdir, sensor) if only in (None, "collect") else _collected(workdir)
         if only == "collect":
@@ -51,7 +51,7 @@ def claim(config: Config, workdir: Path) -> None:
     Raises:
         ValueError: The work directory has another configuration. The message names the fields that differ.
     """
-    _files.claim(workdir / "config.json", dataclasses.asdict(config))
+    storage.claim(workdir / "config.json", dataclasses.asdict(config))
 
 
 def collect(config: Config, workdir: Path, sensor: sts.Sensor) -> dataset.Dataset:
@@ -101,7 +101,7 @@ def note(path: Path, lines: Sequence[str]) -> None:
     there = path.read_text(errors="replace") if path.exists() else ""
     new = "".join(f"{line}\n" for line in lines if f"{line}\n" not in there)
     if new:
-        _files.write_bytes(path, (there + new).encode())
+        storage.write_bytes(path, (there + new).encode())
 
 
 class Job(NamedTuple):

@@ -9,11 +9,11 @@ import numpy as np
 import sts_jax as sts
 from experiments.shared import results, transfer
 from experiments.shared.config import TITLES
-from experiments.shared.judging import read_log
 from experiments.shared.progress import say
 from experiments.shared.recorded import NAMES, Config, Recorded
-from sts_jax import _files, evaluation
+from sts_jax import evaluation, storage
 from sts_jax.evaluation import Predicted
+from sts_jax.training import records
 
 MVAE = "mvae-without-pose"
 FLOOR = "the truth itself (entropy)"
@@ -36,7 +36,7 @@ def evaluate(config: Config, data: Recorded, workdir: Path, folder: Path) -> str
     """
     done, table = folder / "metrics.json", folder / "table.md"
     models = {name: folder / "models" / name for name in NAMES}
-    inputs = {"config.json": _files.digest(dataclasses.asdict(config)), "dataset": data.identity}
+    inputs = {"config.json": storage.digest(dataclasses.asdict(config)), "dataset": data.identity}
     judged = {**models, transfer.NAME: transfer.FOLDER}
     inputs |= {f"models/{name}": results.identity(path) for name, path in judged.items()}
     reason = results.stale(done, inputs)
@@ -51,12 +51,12 @@ def evaluate(config: Config, data: Recorded, workdir: Path, folder: Path) -> str
     summary = evaluation.image_summary(
         {**evaluation.image_baselines(data.train, data.validation), **predicted}, data.validation
     )
-    logs = {TITLES[name]: read_log(path) for name, path in models.items()}
+    logs = {TITLES[name]: records.read(path / records.NAME) for name, path in models.items()}
     figures = [folder / "figures" / name for name in ("predictions.png", "training.png")]
     draw(config, data, predicted, figures[0])
     evaluation.figures.training_curves(figures[1], logs)
     text = as_table(config, data, summary, logs)
-    _files.write_bytes(table, text.encode())
+    storage.write_bytes(table, text.encode())
     results.write(done, {"source": data.source, **summary}, inputs, [table, *figures])
     return text
 

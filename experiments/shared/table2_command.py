@@ -16,7 +16,7 @@ from experiments.shared.duration import Line, shown
 from experiments.shared.progress import say
 from experiments.shared.recorded import Config
 from experiments.shared.simulated import Simulated
-from sts_jax import _files
+from sts_jax import storage
 
 _FEW = 2, recorded.LEAST  # number of trajectories after which the time is measured. The first ones include compilation
 _STEPS = 4  # number of gradient steps in a measurement
@@ -64,9 +64,9 @@ def learn(args: Train) -> None:
     if args.only == "collect":
         return
     data = recorded.read(args.config, args.workdir)
-    with _files.lock(folder):
+    with storage.lock(folder):
         content = {**dataclasses.asdict(args.config), "trajectories": data.identity}
-        _files.claim(folder / "config.json", content)
+        storage.claim(folder / "config.json", content)
         if args.only in (None, "train"):
             recorded.train(args.config, data, folder)
         if args.only in (None, "evaluate"):

@@ -1,8 +1,5 @@
 """Datasets on disk: `collect` simulates, renders and writes them, and `load` reads them as arrays."""
 
-from sts_jax._files import DamagedFileError as DamagedFileError
-from sts_jax._files import LockedError as LockedError
-from sts_jax._files import claim as claim
 from sts_jax.dataset.collecting import Collected as Collected
 from sts_jax.dataset.collecting import Progress as Progress
 from sts_jax.dataset.collecting import collect as collect
@@ -23,7 +20,6 @@ from sts_jax.dataset.meshes import Meshes as Meshes
 from sts_jax.dataset.meshes import mesh_classes as mesh_classes
 from sts_jax.dataset.meshes import survey_meshes as survey_meshes
 from sts_jax.dataset.records import Images as Images
-from sts_jax.dataset.records import write_arrays as write_arrays
 from sts_jax.dataset.rendering import empty_frame as empty_frame
 from sts_jax.dataset.rendering import frames_per_call as frames_per_call
 from sts_jax.dataset.rendering import render_uint8 as render_uint8
@@ -31,16 +27,13 @@ from sts_jax.dataset.rendering import render_uint8 as render_uint8
 __all__ = [
     "Collected",
     "Collection",
-    "DamagedFileError",
     "Dataset",
     "Ends",
     "Images",
-    "LockedError",
     "Meshes",
     "Pairs",
     "Progress",
     "Views",
-    "claim",
     "class_names",
     "collect",
     "empty_frame",
@@ -55,5 +48,4 @@ __all__ = [
     "split_objects",
     "survey_meshes",
     "symmetries_of",
-    "write_arrays",
 ]

@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from sts_jax import objects, physics
-from sts_jax._files import claim, digest, lock, read_json
 from sts_jax.dataset import records
 from sts_jax.dataset.collection import (
     Collection,
@@ -27,6 +26,7 @@ from sts_jax.dataset.collection import (
 )
 from sts_jax.dataset.rendering import render
 from sts_jax.sensor import Sensor
+from sts_jax.storage import claim, digest, lock, read_json
 
 
 class Collected(NamedTuple):

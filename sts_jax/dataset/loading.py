@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from sts_jax._files import DamagedFileError, digest, read_json, sha256
 from sts_jax.dataset import records
 from sts_jax.dataset.collection import PARTS
 from sts_jax.dataset.symmetry import turn, turn_condition
+from sts_jax.storage import DamagedFileError, digest, read_json, sha256
 
 
 class Pairs(NamedTuple):

@@ -10,7 +10,6 @@ The identity and the SHA-256 show a reader whether one of the two files comes fr
 is written last, and a shard without `NAME.npz` counts as missing.
 """
 
-import io
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,7 +18,7 @@ import numpy as np
 from array_record.python.array_record_module import ArrayRecordReader, ArrayRecordWriter
 
 from sts_jax import physics
-from sts_jax._files import DamagedFileError, sha256, write_bytes, write_whole
+from sts_jax.storage import DamagedFileError, read_arrays, sha256, write_arrays, write_whole
 
 FORMAT = 4  # format of a dataset's files, incremented when older files can no longer be read
 ARRAYS = {  # names of the arrays in a shard's .npz, apart from its identity
@@ -121,11 +120,11 @@ def read_shard(path: Path, identity: Identity) -> dict[str, np.ndarray]:
         DamagedFileError: A file is damaged, or belongs to another shard or dataset. The message names the file.
     """
     small = path.with_suffix(".npz")
-    arrays = read_arrays(small)
     again = (
         f"delete {small.name} and {path.name}, then start the collection again. The collection makes only the missing "
         "shards"
     )
+    arrays = read_arrays(small, again)
     names = {f"identity/{name}" for name in (*Identity._fields, "images")}
     lacking = sorted((names | ARRAYS) - set(arrays))
     if lacking:
@@ -149,21 +148,6 @@ def read_shard(path: Path, identity: Identity) -> dict[str, np.ndarray]:
             f"{small.name}): {again}."
         )
     return arrays
-
-
-def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Write named arrays to an `.npz` file, as a whole or not at all.
-
-    Args:
-        path: The file.
-        arrays: The arrays by name.
-
-    Raises:
-        OSError: The file cannot be written. The message names it.
-    """
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **arrays)
-    write_bytes(path, buffer.getvalue())
 
 
 def write_images(path: Path, frames: Iterable[tuple[np.ndarray, ...]]) -> None:
@@ -197,25 +181,6 @@ def _or_os_error(call: Callable[..., Any], *args: Any) -> Any:
         return call(*args)
     except (RuntimeError, ValueError) as error:
         raise OSError(str(error)) from error
-
-
-def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Read the arrays of a file that `write_arrays` wrote.
-
-    Raises:
-        FileNotFoundError: The file does not exist.
-        DamagedFileError: The file is not a complete `.npz` file. The message names it.
-    """
-    try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as arrays:
-            return dict(arrays)
-    except FileNotFoundError:
-        raise
-    except Exception as error:  # np.load raises errors of five types for damaged files
-        raise DamagedFileError(
-            f"{path} is damaged ({error}): delete the file, then start the collection again. The collection makes only "
-            "the missing shards."
-        ) from error
 
 
 def read_images(path: Path, indices: np.ndarray, *, resolution: tuple[int, int], total: int) -> Images:

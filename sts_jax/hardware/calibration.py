@@ -13,7 +13,7 @@ from PIL import Image
 from scipy import optimize
 from scipy.spatial.transform import Rotation
 
-from sts_jax import _files
+from sts_jax import storage
 from sts_jax.hardware.lens import Lens, distort_angle
 
 FEWEST_IMAGES = 6  # least number of usable images
@@ -196,7 +196,7 @@ def save_board(
         else:
             page.save(temporary, "PNG", dpi=(dots_per_inch, dots_per_inch))
 
-    _files.write_whole(path, write)
+    storage.write_whole(path, write)
 
 
 def find_board(image: NDArray[np.uint8], board: Board = Board()) -> FoundCorners:

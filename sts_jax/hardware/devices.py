@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from sts_jax import _files
+from sts_jax import storage
 from sts_jax.hardware.camera_config import CameraConfig
 from sts_jax.hardware.camera_errors import CameraBusyError, CameraError
 
@@ -110,10 +110,10 @@ def locked(config: CameraConfig) -> Iterator[None]:
         if config.kind != "file":
             folder = _lock_folder(config)
             try:
-                stack.enter_context(_files.lock(folder))
-            except _files.LockedError:
+                stack.enter_context(storage.lock(folder))
+            except storage.LockedError:
                 raise CameraBusyError(
-                    f"{config.name} is in use by {_text(folder / _files.OWNER) or 'another process'}: disconnect the "
+                    f"{config.name} is in use by {_text(folder / storage.OWNER) or 'another process'}: disconnect the "
                     "camera in that process, or choose another camera."
                 ) from None
             except OSError as error:
@@ -130,7 +130,7 @@ def device_path(target: int | str) -> str:
 
 
 def _lock_folder(config: CameraConfig) -> Path:
-    """Return the folder that stands for a camera in `_files.lock`. All names of one device have the same folder."""
+    """Return the folder that stands for a camera in `storage.lock`. All names of one device have the same folder."""
     key = os.path.realpath(device_path(config.target)) if config.kind == "device" else str(config.target)
     base = os.environ.get("XDG_RUNTIME_DIR")
     user = os.getuid() if sys.platform != "win32" else os.environ.get("USERNAME", "user")

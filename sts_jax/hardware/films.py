@@ -12,8 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from sts_jax import _files
-from sts_jax._files import DamagedFileError
+from sts_jax import storage
 from sts_jax.hardware import protocol
 from sts_jax.hardware.camera_config import CameraConfig
 from sts_jax.hardware.camera_errors import CameraOpenError
@@ -21,6 +20,7 @@ from sts_jax.hardware.capture import Capture
 from sts_jax.hardware.leds import Lit
 from sts_jax.hardware.recorder import FORMAT, FRAMES, HEAD, video_name
 from sts_jax.hardware.shots import Stream
+from sts_jax.storage import DamagedFileError
 
 _AGAIN = "copy the recording again"
 _RATE = 30.0  # frames per second of a video whose header states no rate
@@ -100,7 +100,7 @@ class RecordedFilm(Film):
     def _check_head(self) -> None:
         path = self._folder / HEAD
         try:
-            head = _files.read_json(path, _AGAIN)
+            head = storage.read_json(path, _AGAIN)
         except (FileNotFoundError, NotADirectoryError):
             raise FileNotFoundError(
                 f"{self._folder} holds no recording ({HEAD} is missing): give the folder of a recording, or two videos."

@@ -26,7 +26,7 @@ from typing import Any
 
 import cv2
 
-from sts_jax import _files
+from sts_jax import storage
 from sts_jax.hardware import matroska
 from sts_jax.hardware.recordings import encoded
 from sts_jax.hardware.sensor_file import Device, sensor_file
@@ -103,7 +103,7 @@ class Recorder:
         self.folder.mkdir(parents=True, exist_ok=True)
         if file is not None:
             _copy_sensor(sensor_file(file), self.folder)
-        _files.write_json(
+        storage.write_json(
             self.folder / HEAD,
             {
                 "format": FORMAT,
@@ -196,7 +196,7 @@ class Recorder:
                 raise
         except OSError as error:
             raise OSError(
-                f"cannot write {path}: {error}. {_files.remedy(error)}. Everything that was recorded before is kept."
+                f"cannot write {path}: {error}. {storage.remedy(error)}. Everything that was recorded before is kept."
             ) from error
         return before + len(data)
 

@@ -28,12 +28,12 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from sts_jax import _files
-from sts_jax._files import DamagedFileError
+from sts_jax import storage
 from sts_jax.hardware.guide import End
 from sts_jax.hardware.leds import Lit
 from sts_jax.hardware.settling import Settling
 from sts_jax.hardware.shots import Pair, Shot, Stream
+from sts_jax.storage import DamagedFileError
 
 FORMAT = 1  # version of the format of a session. Incremented when older files can no longer be read
 SESSION, CONFIRMED, PAIR = "session.json", "confirmed.json", "pair.json"
@@ -117,7 +117,7 @@ class Recordings:
             FileNotFoundError: A trajectory was discarded after these recordings were loaded.
         """
         files = {number: trajectory_folder(self.folder, number) / CONFIRMED for number in self.numbers}
-        return _files.digest({str(number): _files.sha256(file) for number, file in files.items()})
+        return storage.digest({str(number): storage.sha256(file) for number, file in files.items()})
 
     def __getitem__(self, index: int) -> RecordedTrajectory:
         """Read the trajectory at an index of `numbers`. The index differs from the trajectory's number.
@@ -187,7 +187,7 @@ def read_session(folder: Path) -> dict[str, Any]:
     """Return the content of `session.json` in a session's folder. See `load_recordings` for the exceptions."""
     path = folder / SESSION
     try:
-        content = _files.read_json(path, "restore it from a backup")
+        content = storage.read_json(path, "restore it from a backup")
     except FileNotFoundError:
         raise FileNotFoundError(
             f"{folder} holds no session ({SESSION} is missing): give the folder of a session."
@@ -262,7 +262,7 @@ def _locked(folder: str | os.PathLike) -> Iterator[Path]:
     """Check that a folder is a session, and lock it."""
     path = Path(folder)
     read_session(path)
-    with _files.lock(path):
+    with storage.lock(path):
         yield path
 
 
@@ -395,8 +395,8 @@ def confirm_trajectory(folder: Path, number: int, note: str = "") -> None:
     sums: dict[str, str] = {end: _pair_sum(path, end) for end in _ENDS}
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
     content = {"format": FORMAT, "number": number, "confirmed": now, "note": note, **sums}
-    _files.write_json(path / CONFIRMED, {**content, "checksum": _files.digest(content)})
-    _files.flush_folder(path)
+    storage.write_json(path / CONFIRMED, {**content, "checksum": storage.digest(content)})
+    storage.flush_folder(path)
 
 
 def _pair_sum(path: Path, end: str) -> str:
@@ -407,7 +407,7 @@ def _pair_sum(path: Path, end: str) -> str:
             f"trajectory {path.name} cannot be confirmed, because it has no {end} pair of images ({file} does not "
             "exist): discard the trajectory, or give the number of another trajectory."
         )
-    return _files.sha256(file)
+    return storage.sha256(file)
 
 
 def discard_trajectory(folder: Path, number: int) -> None:
@@ -453,7 +453,7 @@ def _move(source: Path, target: Path) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     source.rename(target)
     for path in (target.parent, source.parent):
-        _files.flush_folder(path)
+        storage.flush_folder(path)
 
 
 def read_trajectory(folder: Path, number: int) -> RecordedTrajectory:
@@ -473,9 +473,9 @@ def read_trajectory(folder: Path, number: int) -> RecordedTrajectory:
         raise FileNotFoundError(
             f"{folder} has no confirmed trajectory {number}: list the trajectories with list_recordings()."
         )
-    content = _files.read_json(file, _remedy(number))
+    content = storage.read_json(file, _remedy(number))
     checksum = content.pop("checksum", None) if isinstance(content, dict) else None
-    if checksum != _files.digest(content):
+    if checksum != storage.digest(content):
         raise DamagedFileError(f"{file} is damaged (its checksum does not match its content): {_remedy(number)}.")
     if content["number"] != number:
         raise DamagedFileError(

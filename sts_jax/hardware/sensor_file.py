@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from sts_jax import _files
+from sts_jax import storage
 from sts_jax.hardware import protocol
 from sts_jax.hardware.camera_config import CameraConfig
 from sts_jax.hardware.lens import Lens
@@ -206,7 +206,7 @@ class Device:
             background_tactile=self.background_tactile if tactile is None else _written(file, "tactile", tactile),
         )
         device._check_backgrounds(file)
-        _files.write_json(file, {**constants, "device": {"version": VERSION, **dataclasses.asdict(device)}})
+        storage.write_json(file, {**constants, "device": {"version": VERSION, **dataclasses.asdict(device)}})
         return device
 
     @classmethod
@@ -226,7 +226,7 @@ class Device:
                 is missing, unknown or out of range. Or a background image is missing or damaged.
         """
         file = sensor_file(path)
-        values = _files.read_json(file, f"{_COMMISSION} again")
+        values = storage.read_json(file, f"{_COMMISSION} again")
         device = values.get("device") if isinstance(values, dict) else None
         if not isinstance(device, dict):
             raise SensorFileError(
@@ -327,7 +327,7 @@ def _written(file: Path, stream: Stream, image: NDArray[np.uint8]) -> Background
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, "PNG", compress_level=3)
     path = file.with_name(f"background_{stream}.png")
-    _files.write_bytes(path, buffer.getvalue())
+    storage.write_bytes(path, buffer.getvalue())
     return Background(path.name, hashlib.sha256(buffer.getvalue()).hexdigest())
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 
-from sts_jax import _files
+from sts_jax import storage
 from sts_jax.hardware import devices, protocol, recordings
 from sts_jax.hardware.camera_config import CameraConfig
 from sts_jax.hardware.guide import End
@@ -137,8 +137,8 @@ class Session:
         """
         folder = Path(folder)
         with contextlib.ExitStack() as stack:
-            stack.enter_context(_files.lock(folder))
-            _files.claim(
+            stack.enter_context(storage.lock(folder))
+            storage.claim(
                 folder / recordings.SESSION,
                 {"format": recordings.FORMAT, **dataclasses.asdict(origin)},
             )
@@ -147,7 +147,7 @@ class Session:
             # A process that was killed leaves partial files.
             for rest in (*folder.glob(".*.partial"), *folder.glob(f"{recordings.TRAJECTORIES}/*/.*.partial")):
                 shutil.rmtree(rest, ignore_errors=True) if rest.is_dir() else rest.unlink(missing_ok=True)
-            _files.flush_folder(folder)
+            storage.flush_folder(folder)
             return cls(folder, stack.pop_all(), settling)
 
     @property
@@ -214,9 +214,9 @@ class Session:
 
         def write() -> None:
             if not (folder / end).exists():
-                _files.write_folder(folder / end, recordings.encoded_pair(pair, self._settling))
-            _files.flush_folder(folder)
-            _files.flush_folder(folder.parent)
+                storage.write_folder(folder / end, recordings.encoded_pair(pair, self._settling))
+            storage.flush_folder(folder)
+            storage.flush_folder(folder.parent)
 
         self._add(_Job(f"the {end} pair of trajectory {number}", write))
         self._saved.add((number, end))

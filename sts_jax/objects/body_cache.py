@@ -10,10 +10,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from sts_jax._files import write_whole
 from sts_jax.objects.body import FACE_CLASSES, HULL_CLASSES, PART_CLASSES, TEXTURE_CLASSES, Body
 from sts_jax.objects.items import Entry, Item, Library
 from sts_jax.objects.materials import references
+from sts_jax.storage import write_arrays
 
 _FORMAT = 1  # version of cached bodies, increased when the same file and settings lead to another body
 
@@ -53,12 +53,7 @@ def write(path: Path, entry: Entry) -> None:
     """Write a loaded item to a cache file. An interruption leaves no incomplete file at `path`."""
     about = json.dumps({"gaps": entry.gaps, "notes": entry.notes})
     leaves: dict[str, Any] = {field.name: getattr(entry.body, field.name) for field in dataclasses.fields(Body)}
-
-    def save(temporary: Path) -> None:
-        with temporary.open("wb") as file:  # NumPy would add a suffix to a file name
-            np.savez(file, about=np.frombuffer(about.encode(), np.uint8), **leaves)
-
-    write_whole(path, save)
+    write_arrays(path, {"about": np.frombuffer(about.encode(), np.uint8), **leaves})
 
 
 def read(path: Path, item: Item) -> Entry | None:

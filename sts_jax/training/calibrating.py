@@ -5,7 +5,7 @@ from pathlib import Path
 
 from flax import nnx
 
-from sts_jax import _files, statespace
+from sts_jax import statespace, storage
 from sts_jax.training import calibration
 from sts_jax.training.arrays import Arrays
 from sts_jax.training.learners import learner
@@ -55,6 +55,6 @@ def calibrate(workdir: str | os.PathLike[str], arrays: Arrays) -> Model:
         present=arrays.present,
         condition=arrays.condition,
     )
-    with _files.lock(folder):
+    with storage.lock(folder):
         calibration.write(folder, found, model.config.inputs, data)
     return model._replace(calibration=found)

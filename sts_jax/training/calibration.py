@@ -10,7 +10,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from sts_jax import _files, statespace
+from sts_jax import statespace, storage
 from sts_jax.training import manifest
 
 NAME = "calibration.json"
@@ -35,7 +35,7 @@ def write(folder: Path, calibration: statespace.Calibration, inputs: tuple[str, 
         members = [name for i, name in enumerate(inputs) if number & 2**i]
         subsets[" and ".join(members) or "no input"] = dict(zip(calibration._fields, row, strict=True))
     content = {"format": _FORMAT, "weights": _weights(folder), "data": data, "subsets": subsets}
-    _files.write_json(folder / NAME, {**content, "checksum": _files.digest(content)})
+    storage.write_json(folder / NAME, {**content, "checksum": storage.digest(content)})
 
 
 def read(folder: Path) -> tuple[statespace.Calibration, int | None] | None:
@@ -58,11 +58,11 @@ def read(folder: Path) -> tuple[statespace.Calibration, int | None] | None:
     )
     if not path.exists():
         return None
-    content: Any = _files.read_json(path, remedy)
-    if not isinstance(content, dict) or content.pop("checksum", None) != _files.digest(content):
-        raise _files.DamagedFileError(f"{path} was changed or damaged (its checksum differs): {remedy}.")
+    content: Any = storage.read_json(path, remedy)
+    if not isinstance(content, dict) or content.pop("checksum", None) != storage.digest(content):
+        raise storage.DamagedFileError(f"{path} was changed or damaged (its checksum differs): {remedy}.")
     if content["format"] != _FORMAT:
-        raise _files.DamagedFileError(f"{path} was written by another version of sts_jax: {remedy}.")
+        raise storage.DamagedFileError(f"{path} was written by another version of sts_jax: {remedy}.")
     if content["weights"] != _weights(folder):
         return None
     default = {"contrast": statespace.CONTRAST}  # older files lack the contrast
@@ -73,4 +73,4 @@ def read(folder: Path) -> tuple[statespace.Calibration, int | None] | None:
 def _weights(folder: Path) -> str | None:
     """A checksum of the files that the manifest lists, or None without a manifest."""
     listed = manifest.read(folder)
-    return None if listed is None else _files.digest(sorted(listed.files.items()))
+    return None if listed is None else storage.digest(sorted(listed.files.items()))

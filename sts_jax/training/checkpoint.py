@@ -28,7 +28,7 @@ from flax import nnx
 from jaxtyping import Array, Int
 from orbax.checkpoint import v1 as ocp
 
-from sts_jax import _files
+from sts_jax import storage
 from sts_jax.training import manifest, rounded
 
 WEIGHTS, OPTIMISER = "weights", "optimiser"  # the parts of a checkpoint
@@ -89,7 +89,7 @@ def save(folder: Path, state: TrainState | Weights, *, compact: bool = False) ->
         except Exception as error:  # Orbax and TensorStore raise many types, with pages of traceback
             left = "no earlier checkpoint exists" if kept is None else f"the checkpoint of step {kept} is kept"
             raise OSError(
-                f"cannot write {path}: {_first_line(error)}. {_files.remedy(error)}, then start again ({left})."
+                f"cannot write {path}: {_first_line(error)}. {storage.remedy(error)}, then start again ({left})."
             ) from None
         manifest.write(folder, step)
         kept = step

@@ -17,7 +17,7 @@ import optax
 from flax import nnx
 from jaxtyping import Array
 
-from sts_jax import _files
+from sts_jax import storage
 from sts_jax.training import manifest, optimisers, records
 from sts_jax.training.arrays import Arrays, Batch, order
 from sts_jax.training.checkpoint import TrainState, restore, save
@@ -176,11 +176,11 @@ def train(
     settings = json.loads(json.dumps(settings))
     there = manifest.read(workdir)
     if there is not None and there.step == total:  # without a lock, because a lock would write a file
-        _files.claim(workdir / "config.json", settings)
+        storage.claim(workdir / "config.json", settings)
         _send(records.read(workdir / records.NAME, total), log)
         return load(workdir)
-    with _files.lock(workdir):
-        _files.claim(workdir / "config.json", settings)
+    with storage.lock(workdir):
+        storage.claim(workdir / "config.json", settings)
         optimiser = optimiser or optimisers.optimiser(config, total)
         graphdef, state = initial(config, task, total, optimiser)
         state = restore(workdir, state) or state

@@ -8,7 +8,7 @@ deleted. If the process is killed at any time, all files that the manifest lists
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sts_jax import _files
+from sts_jax import storage
 
 NAME = "manifest.json"
 _FORMAT = 1
@@ -36,9 +36,9 @@ def read(folder: Path) -> Manifest | None:
     path, remedy = folder / NAME, _remedy(folder)
     if not path.exists():
         return None
-    content = _files.read_json(path, remedy)
+    content = storage.read_json(path, remedy)
     if not _is_manifest(content):
-        raise _files.DamagedFileError(f"{path} is damaged, or was written by another version of sts_jax: {remedy}.")
+        raise storage.DamagedFileError(f"{path} is damaged, or was written by another version of sts_jax: {remedy}.")
     return Manifest(content["step"], content["files"])
 
 
@@ -62,8 +62,8 @@ def write(folder: Path, step: int | None) -> Manifest:
     old = read(folder)
     files = {} if old is None else {name: digest for name, digest in old.files.items() if name in _BESIDE}
     names = _there(folder, step)
-    files = {name: files.get(name) or _files.sha256(folder / name) for name in names}
-    _files.write_json(folder / NAME, {"format": _FORMAT, "step": step, "files": files})
+    files = {name: files.get(name) or storage.sha256(folder / name) for name in names}
+    storage.write_json(folder / NAME, {"format": _FORMAT, "step": step, "files": files})
     return Manifest(step, files)
 
 
@@ -79,8 +79,8 @@ def add(folder: Path, name: str) -> None:
     """
     old = read(folder)
     if old is not None:
-        files = old.files | {name: _files.sha256(folder / name)}
-        _files.write_json(folder / NAME, {"format": _FORMAT, "step": old.step, "files": files})
+        files = old.files | {name: storage.sha256(folder / name)}
+        storage.write_json(folder / NAME, {"format": _FORMAT, "step": old.step, "files": files})
 
 
 def verify(folder: Path, manifest: Manifest) -> None:
@@ -96,21 +96,21 @@ def verify(folder: Path, manifest: Manifest) -> None:
     remedy = _remedy(folder)
     for name in _there(folder, manifest.step):
         if name not in manifest.files:
-            raise _files.DamagedFileError(
+            raise storage.DamagedFileError(
                 f"{folder / name} is not listed in {NAME}: the file does not belong to this model. Move it elsewhere, "
                 f"or {remedy}."
             )
     for name, digest in manifest.files.items():
         path = folder / name
         try:
-            found = _files.sha256(path)
+            found = storage.sha256(path)
         except FileNotFoundError:
-            raise _files.DamagedFileError(f"{path} is missing, but {NAME} lists it: {remedy}.") from None
+            raise storage.DamagedFileError(f"{path} is missing, but {NAME} lists it: {remedy}.") from None
         except (OSError, ValueError) as error:  # ValueError: a damaged manifest may list a name with a null byte
-            raise _files.DamagedFileError(f"{path} cannot be read ({error}): {remedy}.") from error
+            raise storage.DamagedFileError(f"{path} cannot be read ({error}): {remedy}.") from error
         if found != digest:
             again = " or delete this file and start the training again" if name == "blank.npz" else ""
-            raise _files.DamagedFileError(
+            raise storage.DamagedFileError(
                 f"{path} is not the file that {NAME} lists: its SHA-256 differs. The file was edited, exchanged or "
                 f"damaged: {remedy}{again}."
             )

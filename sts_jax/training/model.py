@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from sts_jax import _files, mvae, statespace
+from sts_jax import mvae, statespace, storage
 from sts_jax.training import calibration, manifest
 from sts_jax.training.checkpoint import Weights, read, verified
 from sts_jax.training.learners import Config, learner
@@ -73,7 +73,7 @@ def _load(workdir: Path) -> Model:
     if not path.exists():
         raise FileNotFoundError(f"{workdir} has no config.json: give the folder of a trained model, or train one there")
     checkpoint = verified(workdir)
-    settings = _files.read_json(path, f"delete {workdir} and train again")
+    settings = storage.read_json(path, f"delete {workdir} and train again")
     if checkpoint is None:
         raise FileNotFoundError(f"{workdir} has no checkpoint: run its training until the first checkpoint is written")
     try:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8
 
-from sts_jax import _files, geometry
+from sts_jax import geometry, storage
 from sts_jax.training import manifest
 
 # The contact test of noisy images. It has the same values as the contact test of the collection of recordings
@@ -197,14 +197,9 @@ def save_blank(folder: Path, visual: np.ndarray, tactile: np.ndarray) -> None:
         OSError: The file cannot be written, or the manifest of the model is damaged.
     """
     path = folder / "blank.npz"
-
-    def write(temporary: Path) -> None:
-        with temporary.open("wb") as file:  # an open file, because NumPy would add `.npz` to the name
-            np.savez(file, visual=visual, tactile=tactile)
-
     new = not path.exists()
     if new:
-        _files.write_whole(path, write)
+        storage.write_arrays(path, {"visual": visual, "tactile": tactile})
     listed = manifest.read(folder)
     if listed is not None and (new or path.name not in listed.files):
         manifest.add(folder, path.name)
@@ -235,7 +230,7 @@ def load_blank(folder: Path) -> tuple[np.ndarray, np.ndarray]:
             found = ", ".join(f"{image.dtype} {image.shape}" for image in images)
             raise ValueError(f"the images are {found}, but they must be uint8 (height, width, 3)")
     except Exception as error:  # zipfile, zlib and NumPy raise many types for damaged archives
-        raise _files.DamagedFileError(
+        raise storage.DamagedFileError(
             f"{path} is damaged ({type(error).__name__}: {error}): delete it and start the training again, which "
             "writes the file anew."
         ) from error

@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from sts_jax import _files
+from sts_jax import storage
 from sts_jax.training.learners import Terms
 
 NAME = "metrics.jsonl"
@@ -29,12 +29,12 @@ def mean(step: int, recent: list[Terms]) -> Record:
     return {"step": step, **jax.tree.map(lambda *x: float(np.mean(x)), *recent)}
 
 
-def read(path: Path, last: int) -> list[Record]:
+def read(path: Path, last: int | None = None) -> list[Record]:
     """Read the records up to a step. A damaged last line is left out, because an interruption may have cut it.
 
     Args:
         path: Training log. It need not exist.
-        last: Last step whose record is returned.
+        last: Last step whose record is returned (None: return all records).
 
     Returns:
         The records in the order of the file.
@@ -54,11 +54,11 @@ def read(path: Path, last: int) -> list[Record]:
     for number, line in enumerate(lines, 1):
         try:
             record = json.loads(line.decode())
-            keep = record["step"] <= last
+            keep = last is None or record["step"] <= last
         except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError) as error:
             if number == len(lines):  # the process was killed while it wrote this line
                 break
-            raise _files.DamagedFileError(
+            raise storage.DamagedFileError(
                 f"{path}, line {number}, is damaged ({type(error).__name__}: {error}): delete this line to "
                 "continue without its record, or delete the file to continue without the earlier records."
             ) from error
@@ -73,7 +73,7 @@ def write(path: Path, records: list[Record]) -> None:
     Raises:
         OSError: The file cannot be written.
     """
-    _files.write_bytes(path, "".join(json.dumps(record) + "\n" for record in records).encode())
+    storage.write_bytes(path, "".join(json.dumps(record) + "\n" for record in records).encode())
 
 
 def append(path: Path, record: Record) -> None:
@@ -87,5 +87,5 @@ def append(path: Path, record: Record) -> None:
             file.write(json.dumps(record) + "\n")
     except OSError as error:
         raise OSError(
-            f"cannot write {path}: {error}. {_files.remedy(error)}, then start again (the last checkpoint is kept)."
+            f"cannot write {path}: {error}. {storage.remedy(error)}, then start again (the last checkpoint is kept)."
         ) from error

@@ -6,7 +6,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
-from sts_jax._files import write_whole
+from sts_jax.storage import write_whole
 
 
 def show(axis: Axes, image: np.ndarray) -> None:

@@ -11,8 +11,8 @@ from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
 from matplotlib.text import Annotation, Text
 
-from sts_jax._files import write_bytes
 from sts_jax.evaluation.figures import drawing
+from sts_jax.storage import write_bytes
 
 SLOWER = 2  # duration of an animation divided by the duration of the motion
 _HEAD, _PANEL = 44, 104  # pixels, height of the text above the images and of one panel of curves below them

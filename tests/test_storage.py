@@ -10,19 +10,19 @@ from pathlib import Path
 
 import pytest
 
-from sts_jax import _files
+from sts_jax import storage
 
 
 def test_an_interrupted_write_keeps_the_previous_file(tmp_path):
     path = tmp_path / "deep" / "a.txt"
-    _files.write_bytes(path, b"before")
+    storage.write_bytes(path, b"before")
 
     def killed(temporary: Path) -> None:
         temporary.write_bytes(b"half of")
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        _files.write_whole(path, killed)
+        storage.write_whole(path, killed)
     assert path.read_bytes() == b"before"
     assert [p.name for p in path.parent.iterdir()] == ["a.txt"]
 
@@ -33,7 +33,7 @@ def test_a_full_disk_gives_an_error_with_the_file_and_leaves_no_file(tmp_path):
         raise OSError(28, "No space left on device")
 
     with pytest.raises(OSError, match=r"cannot write .*x\.npz: .*No space left.*Free some disk space"):
-        _files.write_whole(tmp_path / "x.npz", full)
+        storage.write_whole(tmp_path / "x.npz", full)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -51,13 +51,13 @@ def test_the_remedy_fits_the_error(tmp_path, number, remedy):
         raise OSError(number, os.strerror(number))
 
     with pytest.raises(OSError, match=rf"\. {remedy} start again"):
-        _files.write_whole(tmp_path / "x.npz", fails)
+        storage.write_whole(tmp_path / "x.npz", fails)
 
 
 def test_a_folder_in_the_way_is_named(tmp_path):
     (tmp_path / "x.npz").mkdir()
     with pytest.raises(OSError, match=r"cannot write .*x\.npz: .*Remove the file or folder that is in the way"):
-        _files.write_bytes(tmp_path / "x.npz", b"")
+        storage.write_bytes(tmp_path / "x.npz", b"")
 
 
 def test_an_error_of_the_writer_passes_unchanged(tmp_path):
@@ -65,79 +65,79 @@ def test_an_error_of_the_writer_passes_unchanged(tmp_path):
         raise ValueError("not of this shape")
 
     with pytest.raises(ValueError, match=r"^not of this shape$"):
-        _files.write_whole(tmp_path / "x", wrong)
+        storage.write_whole(tmp_path / "x", wrong)
 
 
 def test_a_folder_is_written_as_a_whole_or_not_at_all(tmp_path, monkeypatch):
-    _files.write_folder(tmp_path / "deep" / "a", {"one": b"1", "two": b"2"})
+    storage.write_folder(tmp_path / "deep" / "a", {"one": b"1", "two": b"2"})
     assert {path.name: path.read_bytes() for path in (tmp_path / "deep/a").iterdir()} == {"one": b"1", "two": b"2"}
     with pytest.raises(OSError, match=r"cannot write .*a: .*Remove the file or folder that is in the way"):
-        _files.write_folder(tmp_path / "deep" / "a", {"one": b"3"})
+        storage.write_folder(tmp_path / "deep" / "a", {"one": b"3"})
     monkeypatch.setattr(os, "fsync", lambda _: (_ for _ in ()).throw(OSError(errno.ENOSPC, "No space left on device")))
     with pytest.raises(OSError, match=r"cannot write .*b: .*No space left.*Free some disk space\."):
-        _files.write_folder(tmp_path / "deep" / "b", {"one": b"1"})
+        storage.write_folder(tmp_path / "deep" / "b", {"one": b"1"})
     assert [path.name for path in (tmp_path / "deep").iterdir()] == ["a"]
     assert (tmp_path / "deep/a/one").read_bytes() == b"1"
 
 
 def test_reading_inverts_writing(tmp_path):
     content = {"seed": 0, "sizes": [1, 2.5], "name": None}
-    _files.write_json(tmp_path / "a.json", content)
-    assert _files.read_json(tmp_path / "a.json", "delete it") == content
+    storage.write_json(tmp_path / "a.json", content)
+    assert storage.read_json(tmp_path / "a.json", "delete it") == content
     with pytest.raises(FileNotFoundError):
-        _files.read_json(tmp_path / "b.json", "delete it")
+        storage.read_json(tmp_path / "b.json", "delete it")
 
 
 @pytest.mark.parametrize("content", [b"", b'{"seed"', b"\xff\xfe{}", b"1" * 5000])
 def test_damaged_json_is_named_with_the_remedy(tmp_path, content):
     path = tmp_path / "a.json"
     path.write_bytes(content)
-    with pytest.raises(_files.DamagedFileError, match=r"a\.json cannot be read as JSON .*: delete it\.$"):
-        _files.read_json(path, "delete it")
-    with pytest.raises(_files.DamagedFileError, match=r"a\.json"):
-        _files.claim(path, {"seed": 0})
+    with pytest.raises(storage.DamagedFileError, match=r"a\.json cannot be read as JSON .*: delete it\.$"):
+        storage.read_json(path, "delete it")
+    with pytest.raises(storage.DamagedFileError, match=r"a\.json"):
+        storage.claim(path, {"seed": 0})
     assert path.read_bytes() == content
 
 
 def test_a_folder_instead_of_a_file_is_named(tmp_path):
     (tmp_path / "a.json").mkdir()
-    with pytest.raises(_files.DamagedFileError, match=r"a\.json.*delete it"):
-        _files.read_json(tmp_path / "a.json", "delete it")
+    with pytest.raises(storage.DamagedFileError, match=r"a\.json.*delete it"):
+        storage.read_json(tmp_path / "a.json", "delete it")
 
 
 def test_other_settings_are_refused_and_equal_ones_are_not(tmp_path):
     path = tmp_path / "config.json"
-    _files.claim(path, {"seed": 0, "gel": {"sizes": (1, 2)}})
+    storage.claim(path, {"seed": 0, "gel": {"sizes": (1, 2)}})
     before = path.stat().st_mtime_ns
-    _files.claim(path, {"seed": 0, "gel": {"sizes": (1, 2)}})
+    storage.claim(path, {"seed": 0, "gel": {"sizes": (1, 2)}})
     assert path.stat().st_mtime_ns == before
     with pytest.raises(ValueError, match=r"config\.json was made with seed = 0, but the current settings have 1"):
-        _files.claim(path, {"seed": 1, "gel": {"sizes": (1, 2)}})
+        storage.claim(path, {"seed": 1, "gel": {"sizes": (1, 2)}})
     with pytest.raises(ValueError, match=r"gel\.sizes = \[1, 2\], but the current settings have \[1, 3\]"):
-        _files.claim(path, {"seed": 0, "gel": {"sizes": (1, 3)}})
+        storage.claim(path, {"seed": 0, "gel": {"sizes": (1, 3)}})
     path.write_text("[]")
     with pytest.raises(ValueError, match=r"content = \[\]"):
-        _files.claim(path, {"seed": 0})
+        storage.claim(path, {"seed": 0})
 
 
 def test_a_checksum_is_that_of_the_content(tmp_path):
     path = tmp_path / "a"
     path.write_bytes(b"abc")  # the example of FIPS 180-4
-    assert _files.sha256(path) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    assert storage.sha256(path) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
 
 
 def test_a_digest_depends_on_the_content_and_not_on_the_layout():
     content = {"b": (1, 2), "a": 0.1}
-    assert _files.digest(content) == hashlib.sha256(b'{"a": 0.1, "b": [1, 2]}').hexdigest()
-    assert _files.digest(json.loads(json.dumps(content, indent=7))) == _files.digest(content)
-    assert _files.digest({"b": (1, 3), "a": 0.1}) != _files.digest(content)
+    assert storage.digest(content) == hashlib.sha256(b'{"a": 0.1, "b": [1, 2]}').hexdigest()
+    assert storage.digest(json.loads(json.dumps(content, indent=7))) == storage.digest(content)
+    assert storage.digest({"b": (1, 3), "a": 0.1}) != storage.digest(content)
 
 
 HOLD = """
 import sys
 from pathlib import Path
-from sts_jax import _files
-with _files.lock(Path(sys.argv[1])):
+from sts_jax import storage
+with storage.lock(Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.read()
 """
@@ -146,28 +146,28 @@ with _files.lock(Path(sys.argv[1])):
 def test_a_folder_is_locked_until_the_process_that_holds_it_ends(tmp_path):
     folder = tmp_path / "runs" / "one"
     command = [sys.executable, "-c", HOLD, str(folder)]
-    root = str(Path(_files.__file__).parents[1])
+    root = str(Path(storage.__file__).parents[1])
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     with subprocess.Popen(command, env={**os.environ, "PYTHONPATH": root}, **pipes) as other:
         assert other.stdout.readline() == "held\n"
         with (
             pytest.raises(
-                _files.LockedError, match=rf"one is in use by process {other.pid} on .*: wait until that process"
+                storage.LockedError, match=rf"one is in use by process {other.pid} on .*: wait until that process"
             ),
-            _files.lock(folder),
+            storage.lock(folder),
         ):
             pytest.fail("held twice")
         other.kill()  # without any cleaning
         other.wait()
-    with _files.lock(folder), pytest.raises(_files.LockedError, match=f"process {os.getpid()}"), _files.lock(folder):
+    with storage.lock(folder), pytest.raises(storage.LockedError, match=f"process {os.getpid()}"), storage.lock(folder):
         pytest.fail("held twice")
-    with _files.lock(folder), _files.lock(folder / "dataset"):  # one folder in another is another folder
+    with storage.lock(folder), storage.lock(folder / "dataset"):  # one folder in another is another folder
         pass
 
 
 def test_an_error_in_the_block_passes_and_releases_the_lock(tmp_path):
     for _ in range(2):
-        with pytest.raises(OSError, match=r"^of the block$"), _files.lock(tmp_path):
+        with pytest.raises(OSError, match=r"^of the block$"), storage.lock(tmp_path):
             raise OSError("of the block")
 
 
@@ -177,6 +177,6 @@ def test_a_file_instead_of_a_folder_cannot_be_locked(tmp_path):
     for folder in (path, path / "below"):
         with (
             pytest.raises(OSError, match=r"cannot create or write to .*Choose a folder you can write to"),
-            _files.lock(folder),
+            storage.lock(folder),
         ):
             pytest.fail("held")

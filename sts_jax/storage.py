@@ -1,17 +1,19 @@
-"""Atomic writing of files and folders, JSON files with a check of their content, checksums, and locks on folders."""
+"""Atomic writing of files and folders, reading with errors that name the remedy, checksums, and locks on folders."""
 
 import contextlib
 import errno
 import hashlib
+import io
 import json
 import os
 import platform
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import filelock
+import numpy as np
 
 
 class DamagedFileError(OSError):
@@ -102,6 +104,36 @@ def read_json(path: Path, remedy: str) -> Any:
         raise
     except (OSError, ValueError) as error:  # ValueError: invalid UTF-8 or JSON, or an integer of thousands of digits
         raise DamagedFileError(f"{path} cannot be read as JSON ({error}): {remedy}.") from error
+
+
+def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write named arrays to an `.npz` file atomically. Errors are those of `write_whole`."""
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **arrays)
+    write_bytes(path, buffer.getvalue())
+
+
+def read_arrays(path: Path, remedy: str) -> dict[str, np.ndarray]:
+    """Read the arrays of a file that `write_arrays` wrote.
+
+    Args:
+        path: The file.
+        remedy: Text at the end of the error message, with the remedy for a damaged file.
+
+    Returns:
+        The arrays by name.
+
+    Raises:
+        FileNotFoundError: The file does not exist.
+        DamagedFileError: The file is not a complete `.npz` file.
+    """
+    try:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as arrays:
+            return dict(arrays)
+    except FileNotFoundError:
+        raise
+    except Exception as error:  # np.load raises errors of five types for damaged files
+        raise DamagedFileError(f"{path} is damaged ({error}): {remedy}.") from error
 
 
 def claim(path: Path, content: dict) -> None:
