@@ -64,8 +64,8 @@ def spread(start: np.ndarray, end: np.ndarray, outcome: np.ndarray) -> list[str]
 
     Args:
         start: First poses, `(n, 7)`.
-        end: Last poses of the re-rolls, `(times, n, 7)`.
-        outcome: Outcome of each re-roll, int `(times, n)`.
+        end: Last poses of the repeated simulations of each start, `(times, n, 7)`.
+        outcome: Outcome of each simulation, int `(times, n)`.
 
     Returns:
         Four lines of text.

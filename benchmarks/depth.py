@@ -39,7 +39,11 @@ NUM_POSES = (4, 3, 3)
 
 
 class Difference(NamedTuple):
-    """Pixel counts from the comparison of a depth image with embree's depth image, and the largest interior error."""
+    """Pixel counts and the largest interior error from the comparison of a depth image with embree's depth image.
+
+    A pixel is interior if the rays of its 3x3 neighbourhood all hit the object and the depths of these rays differ by
+    less than 1 mm. The interior error is the error of the depth in interior pixels.
+    """
 
     interior: int
     interior_beyond_10um: int
@@ -197,7 +201,7 @@ def describe(d: Difference) -> str:
 
 
 def main() -> None:
-    """Print a row for each size and object, and the sum for each size."""
+    """Print a row of differences for each image size and object, and their sum for each image size."""
     print(f"{'':28} interior  % <10 um  >100um  worst um elsewhere  % <1 mm silhouette  differs  strays")
     for shape in SIZES:
         found = measure(PROCEDURAL + LOADED + MADE, shape)

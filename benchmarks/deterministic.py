@@ -1,4 +1,4 @@
-"""Errors of a plain network that predicts a single final state, compared with the state-space model at equal cost.
+"""Errors of a plain network that predicts a single final state, for comparison with the state-space model.
 
     python -m benchmarks.deterministic runs/freefall  # a run of --preset default, about 9 minutes on two CPU cores
     python -m benchmarks.deterministic runs/perturbed --scenario perturbed --seconds 480
@@ -6,8 +6,8 @@
 Trains a convolutional network without latent variables on the dataset of a run. The inputs of the network are the
 first images, the first pose and the condition. The loss contains the cross-entropies of the last visual image, of the
 last tactile image and of the outcome, and the squared error of the final pose. Only trajectories with images are used.
-Set `--seconds` to the training time of the run's state-space model. Prints the errors of the network and of the
-baselines. Missing parts of the run's dataset are collected, and no other files are written.
+For a comparison at equal cost, set `--seconds` to the training time of the run's state-space model. Prints the errors
+of the network and of the baselines. Missing parts of the run's dataset are collected, and no other files are written.
 """
 
 import dataclasses

@@ -16,7 +16,8 @@ camera logs the light during each exposure. By this log, an image has a wrong or
 exposure differs from the requested light by more than 0.1 % of the full light.
 
 The camera needs at least two frame periods and one settling time per pair, which limits the rate. The light is switched
-once per pair, in turn on and off. The limit is therefore computed with the mean of the settling times for on and off.
+once per pair, alternately on and off. The limit is therefore computed with the mean of the settling times for on and
+off.
 """
 
 import dataclasses
@@ -58,7 +59,8 @@ class Args:
     def __post_init__(self) -> None:
         if not 0 < len(self.lags_ms) <= self.pairs:
             raise ValueError(
-                f"--lags-ms must have 1 to {self.pairs} values (the upper limit is --pairs), got {len(self.lags_ms)}"
+                f"the number of values of --lags-ms must be at least 1 and at most --pairs ({self.pairs}), "
+                f"got {len(self.lags_ms)}"
             )
 
 

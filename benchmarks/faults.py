@@ -7,7 +7,7 @@
 No hardware is needed. The LED controller is emulated on a pseudo-terminal, and the camera on a local network port
 (`instruments/sensor_peer.py`). The emulated camera sees the lights of the controller, with a random lag and a random
 exposure time. Before each fault the program reads a pair. Then the fault begins at a random moment of a read. Reads
-continue while the fault lasts, and until a pair has been read after its end.
+continue until a pair has been read after the end of the fault.
 
 The emulated camera logs the light during each exposure. By this log, an image is counted as wrong if it was taken under
 a wrong or mixed light, or if the camera never took it. An image is counted as old if its exposure began more than the
@@ -149,7 +149,7 @@ class Bench:
         )
 
     def plug_in(self, name: str) -> None:
-        """Plug the controller in at the emulated port, the symbolic link `name` in the folder."""
+        """Plug in the emulated controller. The controller's port is the symbolic link `name` in the folder."""
         self.peer.plug_in(self.folder / name)
         self.ports[:] = [_usb_port(str(self.folder / name))]
 
@@ -473,7 +473,7 @@ def report(counts: dict[str, Count]) -> str:
 
 
 def main(args: Args) -> str:
-    """Inject the faults, write the table to `--out` if given, and return it."""
+    """Inject the faults, write the table of the results to `--out` if given, and return the table."""
     begun_s = time.monotonic()
     counts = measure(args)
     text = report(counts)

@@ -34,7 +34,11 @@ class Args:
 
 
 def waiting() -> None:
-    """Print the seconds of each step, with an empty compilation cache and with the cache of an earlier process."""
+    """Print how long each first step of a new user takes (s), such as the import and the first image.
+
+    The steps run in two new processes. The first process starts with an empty compilation cache, and the second one
+    with the cache that the first one left.
+    """
     with tempfile.TemporaryDirectory() as folder:
         runs = [fresh.call("benchmarks.instruments.first_steps.stamps", cache=Path(folder)) for _ in range(2)]
     print(f"{'seconds, each step by itself':<32}{'empty cache':>12}{'kept cache':>12}")

@@ -24,5 +24,5 @@ def test_pairs_have_no_wrong_light():
 
 
 def test_fewer_pairs_than_lags_are_refused():
-    with pytest.raises(ValueError, match=r"--lags-ms must have 1 to 2 values \(the upper limit is --pairs\), got 5"):
+    with pytest.raises(ValueError, match=r"--lags-ms must be at least 1 and at most --pairs \(2\), got 5"):
         device.Args(pairs=2)

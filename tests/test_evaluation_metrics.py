@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sts_jax.evaluation import metrics
+from sts_jax.evaluation import intervals, metrics
 
 
 def test_excess_is_the_divergence_summed_pixel_by_pixel():
@@ -91,9 +91,9 @@ def test_bootstrap_over_objects_has_the_standard_error_of_the_mean_over_objects(
     level = rng.normal(size=50)
     groups = np.repeat(np.arange(50), 4)
     values = level[groups] + 0.01 * rng.normal(size=200)
-    draws = metrics.bootstrap(groups, lambda w: np.sum(w * values) / np.sum(w), num=4000)
+    draws = intervals.bootstrap(groups, lambda w: np.sum(w * values) / np.sum(w), num=4000)
     assert np.std(draws) == pytest.approx(np.std(level) / math.sqrt(50), rel=0.1)
-    low, high = metrics.interval(draws)
+    low, high = intervals.interval(draws)
     assert low < values.mean() < high
 
 

@@ -156,7 +156,7 @@ def test_calibration_is_at_the_minimum_and_other_subsets_stay(folder):
     found = training.calibrate(folder, given).calibration
     for number, row in enumerate(np.asarray(found).T):
         touched = bool(number & 2 ** STATE.inputs.index("tactile"))
-        assert (row == (1, 1, 1, networks.CONTRAST)).all() == (touched or number == 0), number
+        assert (row == (1, 1, 1, statespace.CONTRAST)).all() == (touched or number == 0), number
 
 
 @pytest.mark.slow
@@ -202,7 +202,7 @@ def test_fitted_contrast_has_the_gradient_energy_of_the_true_images():
         target = np.asarray(noise * np.sqrt(1.002 * energy), np.float32)
         assert fitting._contrast(graphdef, params, chunks, target, np.ones(3)) == contrast
     blank = np.zeros((NUMBER, STATE.image_size, STATE.image_size, 3), np.uint8)  # all objects fell off
-    assert fitting._contrast(graphdef, params, chunks, blank, np.ones(3)) == networks.CONTRAST
+    assert fitting._contrast(graphdef, params, chunks, blank, np.ones(3)) == statespace.CONTRAST
 
 
 @pytest.mark.slow
@@ -213,7 +213,7 @@ def test_older_calibration_has_the_default_contrast(calibrated):
         del row["contrast"]
     del content["checksum"]
     path.write_text(json.dumps({**content, "checksum": storage.digest(content)}))
-    np.testing.assert_array_equal(training.load(calibrated).calibration.contrast, networks.CONTRAST)
+    np.testing.assert_array_equal(training.load(calibrated).calibration.contrast, statespace.CONTRAST)
 
 
 @pytest.mark.slow

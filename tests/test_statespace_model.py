@@ -15,7 +15,7 @@ from statespace_config import TINY, random_codes, random_states
 from sts_jax import optics, statespace
 from sts_jax.evaluation import metrics
 from sts_jax.mvae import Gaussian
-from sts_jax.statespace import harmonics, networks, objective, poses, state
+from sts_jax.statespace import config, harmonics, layers, networks, objective, poses, state
 
 CONFIG = dataclasses.replace(
     TINY, inputs=("visual", "tactile", "pose"), outcomes=3, condition=3, input_size=32, drawn=0.5, drawn_first=0.5
@@ -251,7 +251,7 @@ def test_decoder_draws_an_object_at_its_projection(model):
 
     @jax.jit
     def draw(code):
-        return networks.compose(nnx.merge(model[0], params).decoder(code, turns, known, look), grey)
+        return layers.compose(nnx.merge(model[0], params).decoder(code, turns, known, look), grey)
 
     drawn = draw(batch)
     for picture in drawn.values():
@@ -264,18 +264,18 @@ def test_decoder_draws_an_object_at_its_projection(model):
 def test_share_of_levels_that_cover_a_pixel_is_its_probability():
     chance = np.linspace(0.02, 0.98, 25).reshape(1, 5, 5, 1)
     logit = jnp.tile(jnp.asarray(np.log(chance / (1 - chance)), jnp.float32), (200, 1, 1, 1))
-    layers = networks.Layers(logit, jnp.ones((200, 5, 5, 3)), jnp.zeros((200, 5, 5, 3)))
+    drawn = layers.Layers(logit, jnp.ones((200, 5, 5, 3)), jnp.zeros((200, 5, 5, 3)))
     empty = {"visual": jnp.zeros((5, 5, 3)), "tactile": jnp.full((5, 5, 3), 0.4)}
-    soft = networks.compose(layers, empty)
+    soft = layers.compose(drawn, empty)
     np.testing.assert_allclose(soft["visual"][0], np.broadcast_to(chance[0], (5, 5, 3)), atol=1e-5)
     np.testing.assert_allclose(soft["tactile"], 0.4, rtol=1e-5)
-    sharp = networks.compose(layers, empty, (jnp.arange(200) + 0.5) / 200)
+    sharp = layers.compose(drawn, empty, (jnp.arange(200) + 0.5) / 200)
     np.testing.assert_allclose(np.mean(sharp["visual"], axis=0), soft["visual"][0], atol=0.02)
     outlines = np.asarray(sharp["visual"])
     assert np.mean((outlines < 0.05) | (outlines > 0.95)) > 0.7
     np.testing.assert_array_equal(sharp["tactile"], soft["tactile"])
     level, contrast = jnp.full(200, 0.3), jnp.linspace(1, 9, 200)
-    softer = networks.compose(layers, empty, level, contrast)["visual"]
+    softer = layers.compose(drawn, empty, level, contrast)["visual"]
     odds = (chance / (1 - chance) / (0.3 / 0.7))[0, None] ** np.asarray(contrast)[:, None, None, None]
     np.testing.assert_allclose(softer, np.broadcast_to(odds / (1 + odds), softer.shape), rtol=1e-3, atol=1e-6)
 
@@ -295,7 +295,7 @@ def test_belief_from_the_true_state_is_the_true_state(model, empty, batch):
 
 def test_tint_is_the_mean_colour_of_the_object_in_the_visual_image(model, empty, batch):
     found = jax.jit(lambda inputs: objective.experts(nnx.merge(*model), inputs, batch.present, empty))(batch.inputs)
-    rows = slice(state.CODE, state.CODE + networks.TINT)
+    rows = slice(state.CODE, state.CODE + config.TINT)
     for i, image in enumerate(np.asarray(batch.inputs["visual"], np.float64)):
         change = image - np.asarray(empty["visual"])
         pixels = [pixel for line in change for pixel in line if max(abs(pixel)) > 12 / 255]
@@ -310,8 +310,8 @@ def test_untrained_decoder_draws_objects_in_their_tint(model, batch):
     tint = jnp.array([[0.5, -1.0, 2.0]])
     look = jnp.zeros((1, CONFIG.look)).at[:, :3].set(tint)
     code = batch.targets["state"][:1]
-    layers = nnx.merge(*model).decoder(code[:, :12], jnp.eye(3)[None], code, look)
-    np.testing.assert_allclose(np.mean(layers.colour, axis=(1, 2)), 0.4 + 0.12 * tint, atol=0.1)
+    drawn = nnx.merge(*model).decoder(code[:, :12], jnp.eye(3)[None], code, look)
+    np.testing.assert_allclose(np.mean(drawn.colour, axis=(1, 2)), 0.4 + 0.12 * tint, atol=0.1)
 
 
 def test_belief_from_several_inputs_is_the_product_of_their_beliefs(sample, batch):

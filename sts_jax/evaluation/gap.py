@@ -12,7 +12,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sts_jax.evaluation import metrics
+from sts_jax.evaluation import intervals
 
 LEVELS = 3  # number of scales of the features, each with half the resolution of the previous one
 CELLS = 4  # number of cells of the features along each side of the image
@@ -84,7 +84,7 @@ def pixel_errors(real: np.ndarray, simulated: np.ndarray, group: np.ndarray) -> 
         with np.errstate(divide="ignore"):
             return np.array([mae, rmse, 20 * np.log10(255 / rmse), ssim])
 
-    draws = metrics.bootstrap(group, summary)
+    draws = intervals.bootstrap(group, summary)
     values = summary(np.ones(len(group)))
     return PixelErrors(*(_estimate(value, column) for value, column in zip(values, draws.T, strict=True)))
 
@@ -230,7 +230,7 @@ def told_apart(
         shares = [(side * right).sum() / side.sum() if side.sum() else np.nan for side in sides]
         return np.asarray(np.mean(shares))
 
-    return _estimate(float(accuracy(np.ones(len(x)))), metrics.bootstrap(group, accuracy))
+    return _estimate(float(accuracy(np.ones(len(x)))), intervals.bootstrap(group, accuracy))
 
 
 def _differences(real: np.ndarray, simulated: np.ndarray) -> tuple[float, float, float]:
@@ -308,4 +308,4 @@ def _matched(
 def _estimate(value: float, draws: np.ndarray) -> Estimate:
     """A value with the interval of its bootstrap values."""
     with np.errstate(invalid="ignore"):
-        return Estimate(float(value), *metrics.interval(draws))
+        return Estimate(float(value), *intervals.interval(draws))

@@ -5,7 +5,8 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from sts_jax.evaluation.metrics import ImageError, bootstrap, image_error, interval, mean_per_pixel, skill
+from sts_jax.evaluation.intervals import bootstrap, interval
+from sts_jax.evaluation.metrics import ImageError, image_error, mean_per_pixel, skill
 from sts_jax.evaluation.predictions import Predicted, in_unit
 from sts_jax.evaluation.reference import CONSTANT, COPY, NEIGHBOUR
 

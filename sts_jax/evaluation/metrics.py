@@ -9,7 +9,7 @@ cross-entropy of a value is `BCE(x, p) = -x log p - (1 - x) log(1 - p)`. Its min
 is `1 - excess / constant_excess`, where `constant_excess` is the excess of the mean training image.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -404,34 +404,6 @@ def best_threshold(score: np.ndarray, positive: np.ndarray) -> float:
     candidates = np.concatenate([[values[0] - 1e-6], (values[1:] + values[:-1]) / 2])
     scores = [balanced_accuracy(score > threshold, positive) for threshold in candidates]
     return float(candidates[int(np.argmax(scores))])
-
-
-def bootstrap(
-    groups: np.ndarray, statistic: Callable[[np.ndarray], np.ndarray], *, num: int = 2000, seed: int = 0
-) -> np.ndarray:
-    """Compute a statistic for bootstrap samples, in which whole groups of items are drawn with replacement.
-
-    Args:
-        groups: Group of each item, such as its object, `(n,)`.
-        statistic: Function that takes the weights of the items, `(n,)`, and returns a value or an array of values. The
-            weight of an item is how often its group was drawn.
-        num: Number of bootstrap samples.
-        seed: Seed of the random numbers.
-
-    Returns:
-        Values of the statistic, `(num, ...)`.
-    """
-    rng = np.random.default_rng(seed)
-    _, member = np.unique(groups, return_inverse=True)
-    size = member.max() + 1
-    draws = rng.multinomial(size, np.full(size, 1 / size), size=num)
-    return np.stack([statistic(draw[member].astype(np.float64)) for draw in draws])
-
-
-def interval(draws: np.ndarray) -> tuple[float, float]:
-    """Compute a 95 % interval from bootstrap values: their 2.5 % and 97.5 % quantiles. NaN is ignored."""
-    low, high = np.nanpercentile(draws, [2.5, 97.5])
-    return float(low), float(high)
 
 
 def _xlogx(x: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ import numpy as np
 
 from sts_jax.dataset import Pairs
 from sts_jax.evaluation.catalogue import METRICS
-from sts_jax.evaluation.metrics import bootstrap, interval
+from sts_jax.evaluation.intervals import bootstrap, interval
 from sts_jax.evaluation.outcomes import OUTCOMES, named
 from sts_jax.evaluation.records import Judged, Metric, Scores, Statistic
 from sts_jax.evaluation.reference import BASELINES, CEILINGS, CONSTANT

@@ -1,16 +1,7 @@
 """The real sensor: camera, LED controller, calibration, and recording. This package uses NumPy, not JAX."""
 
-from sts_jax.hardware.calibration import (
-    Board,
-    Calibration,
-    CalibrationError,
-    FoundCorners,
-    board_image,
-    calibrate,
-    find_board,
-    fit_lens,
-    save_board,
-)
+from sts_jax.hardware.board import Board, FoundCorners, board_image, find_board, save_board
+from sts_jax.hardware.calibration import Calibration, CalibrationError, calibrate, fit_lens
 from sts_jax.hardware.camera import Camera
 from sts_jax.hardware.camera_config import CameraConfig
 from sts_jax.hardware.camera_errors import (

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sts_jax.hardware.calibration import CalibrationError, FoundCorners
+from sts_jax.hardware.board import FoundCorners
+from sts_jax.hardware.calibration import CalibrationError
 from sts_jax.hardware.lens import Lens, Pinhole, rectification, window
 
 _RESOLUTION = 480, 640  # height and width of the view at which it is checked (pixels)

@@ -1,8 +1,10 @@
 """A state-space model that predicts final poses and images from any subset of vision, touch and pose."""
 
 from sts_jax.statespace.calibration import Calibration
+from sts_jax.statespace.config import IMAGES, INPUTS, Config
 from sts_jax.statespace.fitting import fit as fit_calibration
-from sts_jax.statespace.networks import CONTRAST, IMAGES, INPUTS, Config, Model, init
+from sts_jax.statespace.layers import CONTRAST
+from sts_jax.statespace.networks import Model, init
 from sts_jax.statespace.objective import loss
 from sts_jax.statespace.poses import CODE as POSE_CODE
 from sts_jax.statespace.predict import Samples, sample

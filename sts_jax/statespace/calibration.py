@@ -24,7 +24,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from sts_jax.mvae import Gaussian
-from sts_jax.statespace.networks import Config, FinalPose, Model
+from sts_jax.statespace.config import Config
+from sts_jax.statespace.networks import FinalPose, Model
 from sts_jax.statespace.objective import experts, fuse, of_state
 
 

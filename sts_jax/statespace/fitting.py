@@ -14,7 +14,8 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy import optimize
 
 from sts_jax.statespace.calibration import Calibration, corrected, predict
-from sts_jax.statespace.networks import CONTRAST, FinalPose, Model, compose
+from sts_jax.statespace.layers import CONTRAST, compose
+from sts_jax.statespace.networks import FinalPose, Model
 from sts_jax.statespace.objective import log_density, rotation_between
 from sts_jax.statespace.predict import draw
 

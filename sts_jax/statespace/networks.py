@@ -12,8 +12,7 @@ All convolutions have stride 1, for which XLA's CPU backend is fast. To reduce a
 into channels. To enlarge an image, channels are unfolded into blocks of pixels.
 """
 
-import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,118 +22,20 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from sts_jax import objects
 from sts_jax.mvae import Gaussian
 from sts_jax.statespace import harmonics, poses, state, window
+from sts_jax.statespace.config import IMAGES, TINT, Config
+from sts_jax.statespace.layers import Layers
 
-IMAGES = ("visual", "tactile")  # names of the images
-INPUTS = (*IMAGES, "pose")  # names of all inputs that a model can have
 UNKNOWN_LOG_VAR = 30.0  # log variance of numbers that an input does not determine: their precision is almost 0
 _LOG_VAR_LIMIT = 8.0  # largest absolute value of an encoder's log variances
 _FINAL_LOG_VAR = (-3.0, 5.0)  # range of the log variances of the final pose: its centre and half of its width
-CONTRAST = 40.0  # contrast of samples without a calibration, see `compose`
 _OUTSIDE = 8.0  # difference of the logit of being covered by the object, between inside and outside of the canvas
 # The tint describes the mean colour of the object in the visual image. For each colour channel, it is the mean change
-# from the empty sensor over the pixels that show the object, minus _MIDDLE, divided by _WIDTH.
-TINT = 3  # numbers of the tint
+# from the empty sensor over the pixels that show the object, minus _MIDDLE, divided by _WIDTH. The tint has
+# `TINT` numbers.
 _MIDDLE, _WIDTH = -0.3, 0.12
 _TINT_LOG_VAR = -6.0  # log variance of a tint that was measured in an image
 _BRIGHT = 0.7  # approximate brightness of the empty sensor
 _SMALL = nnx.initializers.variance_scaling(0.1, "fan_in", "normal")  # for last layers
-
-
-@dataclasses.dataclass(frozen=True)
-class Config:
-    """The configuration of a state-space model, in values that JSON can represent.
-
-    Raises:
-        ValueError: A field is out of range, or the values of two fields do not fit together.
-    """
-
-    inputs: tuple[str, ...] = ("visual", "pose")  # some of `visual`, `tactile` and `pose`, in this order
-    outcomes: int = 2  # number of outcomes of the scenario
-    condition: int = 0  # number of values in the scenario's condition
-    input_size: int = 128  # pixels, side of the input images
-    image_size: int = 64  # pixels, side of the predicted images
-    camera_distance: float = 0.1  # m, from the pinhole to the gel's outer face
-    view: float = 0.15  # m, side of the visible square of the gel's face
-    position_scale: float = 0.05  # m, divisor of positions in pose codes, as in `training.Preprocessing`
-    traits: int = 32  # numbers of the appearance code that do not depend on the rotation, the tint first
-    own: int = 4  # functions on the sphere in the appearance code, for directions in the mesh frame
-    shown: int = 4  # functions on the sphere in the appearance code, for directions in the sensor frame
-    degree: int = 3  # largest degree of the spherical harmonics of these functions
-    directions: int = 24  # number of directions at which the decoder sees the values of these functions
-    support: int = 64  # number of directions at which transition and decoder see the support functions
-    components: int = 6  # Gaussians in the density of the final pose for each outcome
-    window: int = 32  # pixels, side of the magnified window around the object that an encoder sees
-    encoder: tuple[int, ...] = (64, 128, 128)  # channels at 1/2, 1/4 and 1/8 of the window's resolution
-    decoder: tuple[int, ...] = (128, 64, 32)  # channels at 1/8, 1/4 and 1/2 of the canvas's resolution
-    hidden: int = 384  # width of the encoders' fully connected layers
-    transition: int = 512  # width of the transition's layers
-    canvas: int = 64  # pixels, side of the canvas: the image of an object before it is placed in the view
-    canvas_side: float = 0.165  # m, side of the square parallel to the pad that the canvas covers
-    tactile_weight: float = 4.0  # weight of the error of the last tactile image in the loss
-    state_weight: float = 16.0  # weight of the squared error of each encoder's state code
-    pose_weight: float = 4.0  # weight of the negative log likelihoods of the final pose and of the encoders' estimates
-    outcome_weight: float = 8.0  # weight of the negative log likelihood of the outcome
-    covered_weight: float = 0.15  # weight of the cross-entropy of the object's outline
-    first_weight: float = 0.5  # weight of the errors of the images of the first frame
-    look_weight: float = 0.1  # weight of the divergence of the appearance code. Below 1, samples are sharper
-    drawn: float = 0.4375  # share of a batch with a rendered last frame (the whole batch trains the other parts)
-    drawn_first: float = 0.125  # share of a batch with a rendered first frame
-    vectors: int = 1  # number of vectors (x, y) in the plane of the pad with which the condition begins
-
-    def __post_init__(self) -> None:
-        if not self.inputs or [name for name in INPUTS if name in self.inputs] != list(self.inputs):
-            raise ValueError(f"inputs is {self.inputs}, but it must be one or more of {INPUTS}, in this order")
-        if not set(self.inputs) & set(IMAGES):
-            raise ValueError(
-                f"inputs is {self.inputs}, but at least one input must be an image: add 'visual' or 'tactile'"
-            )
-        for name, part in (("window", 8), ("canvas", 8), ("input_size", self.image_size)):
-            if getattr(self, name) % part or getattr(self, name) < part:
-                raise ValueError(
-                    f"{name} is {getattr(self, name)} pixels, but it must be a multiple of {part}"
-                    f"{', the image_size' if name == 'input_size' else ''}"
-                )
-        if len(self.encoder) != 3 or len(self.decoder) != 3:
-            raise ValueError(
-                f"encoder has {len(self.encoder)} widths and decoder has {len(self.decoder)}, but each must have 3 "
-                "widths, one for each resolution of the network"
-            )
-        if self.condition < 0 or (self.condition and not 0 <= 2 * self.vectors <= self.condition):
-            raise ValueError(
-                f"condition is {self.condition} and vectors is {self.vectors}, but vectors must be >= 0, and condition "
-                "must be 0 or at least 2 * vectors, because each vector has two numbers"
-            )
-        if self.traits < TINT:
-            raise ValueError(
-                f"traits is {self.traits}, but it must be >= {TINT}, because the first {TINT} traits describe the mean "
-                "colour of the object"
-            )
-        for name in ("drawn", "drawn_first"):
-            if not 0 < getattr(self, name) <= 1:
-                raise ValueError(
-                    f"{name} is {getattr(self, name)}, but it must be > 0 and <= 1, because it is a share of a batch"
-                )
-
-    @property
-    def look(self) -> int:
-        """Number of values in the appearance code, which describes the visible properties other than pose and shape."""
-        return self.traits + (self.own + self.shown) * harmonics.number(self.degree)
-
-    def to_json(self) -> dict[str, Any]:
-        """The fields by name, in values that `json.dumps` accepts.
-
-        The field `vectors` is left out if it has its default value 1. Older versions saved configurations without this
-        field. The result is therefore equal to the saved configuration of an older version, and the training of the
-        older version can be resumed.
-        """
-        values = dataclasses.asdict(self)
-        return {name: value for name, value in values.items() if (name, value) != ("vectors", 1)}
-
-    @classmethod
-    def from_json(cls, values: dict[str, Any]) -> "Config":
-        """Make a configuration from the result of `to_json`, or from the same values read from a JSON file."""
-        plain: dict[str, Any] = {k: tuple(value) if isinstance(value, list) else value for k, value in values.items()}
-        return cls(**plain)
 
 
 class FinalPose(NamedTuple):
@@ -151,17 +52,6 @@ class FinalPose(NamedTuple):
     mean: Float[Array, "n outcomes k 21"]  # mean of each component
     log_var: Float[Array, "n outcomes k 21"]  # log variances of each component
     heading: Float[Array, "n 2"]  # cosine and sine of the angle from the sensor's x axis, see `state.heading`
-
-
-class Layers(NamedTuple):
-    """Outlines and colours of n rendered objects, and the changes that the objects cause in the tactile images.
-
-    `compose` combines them with the images of the empty sensor, and returns complete images.
-    """
-
-    covered: Float[Array, "n size size 1"]  # logit of the probability that a pixel shows the object
-    colour: Float[Array, "n size size 3"]  # colour of the object, [0, 1]
-    touch: Float[Array, "n size size 3"]  # change of the logits of the tactile image
 
 
 class _Residual(nnx.Module):
@@ -441,41 +331,6 @@ class Decoder(nnx.Module):
         tint = jnp.clip(_BRIGHT + _MIDDLE + _WIDTH * look[:, None, None, :TINT], 0.03, 0.97)
         colour = jax.nn.sigmoid(x[..., :3] + jnp.log(tint / (1 - tint)))
         return Layers(covered=x[..., 3:4] - _OUTSIDE - 3, colour=colour, touch=x[..., 4:7])
-
-
-def compose(
-    layers: Layers,
-    empty: dict[str, Float[Array, "size size 3"]],
-    level: Float[Array, "n"] | None = None,
-    contrast: float | Float[Array, "n"] = CONTRAST,
-) -> dict[str, Float[Array, "n size size 3"]]:
-    """Combine the rendered objects with the images of the empty sensor.
-
-    Args:
-        layers: Rendered images of n objects, from the decoder.
-        empty: `visual` and `tactile` image of the empty sensor in [0, 1], with the size of the rendered images.
-        level: Threshold for each object, from 0 to 1. A threshold gives an object sharp outlines in the visual image.
-            `layers.covered` is the logit of the probability p that the object covers a pixel. If p is well above the
-            threshold, the pixel shows the object. If p is well below the threshold, the pixel shows the empty sensor.
-            If p is near the threshold, the pixel shows a mixture of both. If the threshold is drawn uniformly, the
-            pixel shows the object with the probability p. With None, every pixel shows a mixture: the mean of the
-            colours of the object and the empty sensor, with the weights p and 1 - p.
-        contrast: Sharpness of the outlines if there is a threshold. The weight of the object in a mixture is the
-            sigmoid of `contrast * (logit(p) - logit(level))`.
-
-    Returns:
-        The images `visual` and `tactile` of each object, in [0, 1].
-    """
-    logit = layers.covered
-    if level is not None:
-        level = jnp.clip(level, 0.01, 0.99).reshape(-1, 1, 1, 1)
-        logit = jnp.reshape(contrast, (-1, 1, 1, 1)) * (logit - jnp.log(level / (1 - level)))
-    covered = jax.nn.sigmoid(logit)
-    grey = jnp.clip(empty["tactile"], 0.01, 0.99)
-    return {
-        "visual": covered * layers.colour + (1 - covered) * empty["visual"],
-        "tactile": jax.nn.sigmoid(jnp.log(grey / (1 - grey)) + layers.touch),
-    }
 
 
 def _on_canvas(

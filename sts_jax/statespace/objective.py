@@ -36,7 +36,9 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from sts_jax.mvae import Gaussian, kl_standard_normal, product_of_experts
 from sts_jax.statespace import poses, state, window
-from sts_jax.statespace.networks import IMAGES, TINT, UNKNOWN_LOG_VAR, Config, FinalPose, Model, compose
+from sts_jax.statespace.config import IMAGES, TINT, Config
+from sts_jax.statespace.layers import compose
+from sts_jax.statespace.networks import UNKNOWN_LOG_VAR, FinalPose, Model
 
 EXACT_LOG_VAR = -9.2  # log variance of a pose that is an input: 0.5 mm for a position scale of 50 mm
 _LEAST = 1 / 1020  # rendered images are clipped to this distance from 0 and 1

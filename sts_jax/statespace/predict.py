@@ -9,7 +9,8 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from sts_jax.mvae import Gaussian
 from sts_jax.statespace import calibration, poses, state
-from sts_jax.statespace.networks import CONTRAST, FinalPose, Layers, Model, compose
+from sts_jax.statespace.layers import CONTRAST, Layers, compose
+from sts_jax.statespace.networks import FinalPose, Model
 from sts_jax.statespace.objective import reduced
 
 
@@ -90,7 +91,7 @@ class Drawn(NamedTuple):
     """Samples without complete images: k final poses for each of n items, and layers for some of these poses.
 
     Of the k poses of an item, only the poses with index 0 to `drawn` - 1 have layers. `drawn` is an argument of `draw`.
-    `compose` makes complete images from the layers, see `networks.Layers`.
+    `compose` makes complete images from the layers, see `layers.Layers`.
     """
 
     belief: Gaussian  # posterior of the state code and the appearance code of the first frame, (n, code + look)
@@ -115,7 +116,7 @@ def draw(
 ) -> Drawn:
     """Sample final poses, and render layers for the first `drawn` poses of each item.
 
-    `compose` makes complete images from the layers, see `networks.Layers`. The arguments after `model` are the same as
+    `compose` makes complete images from the layers, see `layers.Layers`. The arguments after `model` are the same as
     in `sample`.
     """
     belief, final = calibration.predict(model, inputs, present, empty, condition, correction)

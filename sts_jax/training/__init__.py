@@ -1,8 +1,9 @@
 """Training of `sts_jax.statespace` and `sts_jax.mvae` models: training arrays, the training loop and checkpoints."""
 
 from sts_jax.training.arrays import Arrays, order
+from sts_jax.training.blank import load_blank, save_blank
 from sts_jax.training.calibrating import calibrate
-from sts_jax.training.calibration import write as save_calibration
+from sts_jax.training.calibration_file import write as save_calibration
 from sts_jax.training.checkpoint import TrainState, Weights, restore, save, seal
 from sts_jax.training.config import TrainConfig
 from sts_jax.training.learners import Learner, Loss, learner
@@ -11,9 +12,7 @@ from sts_jax.training.model import Model, load
 from sts_jax.training.optimisers import optimiser
 from sts_jax.training.preprocess import (
     Preprocessing,
-    load_blank,
     preprocessing_from_json,
-    save_blank,
     touch_of_noisy_images,
 )
 from sts_jax.training.shifts import shifted

@@ -6,7 +6,7 @@ from pathlib import Path
 from flax import nnx
 
 from sts_jax import statespace, storage
-from sts_jax.training import calibration
+from sts_jax.training import calibration_file
 from sts_jax.training.arrays import Arrays
 from sts_jax.training.learners import learner
 from sts_jax.training.model import Model, load
@@ -42,7 +42,7 @@ def calibrate(workdir: str | os.PathLike[str], arrays: Arrays) -> Model:
             "of a state-space model"
         )
     learner(model.config).check(arrays)
-    there, data = calibration.read(folder), arrays.checksum()
+    there, data = calibration_file.read(folder), arrays.checksum()
     if there is not None and there[1] == data:
         return model
     params, _ = nnx.split_state(model.state, nnx.Param, nnx.BatchStat)
@@ -56,5 +56,5 @@ def calibrate(workdir: str | os.PathLike[str], arrays: Arrays) -> Model:
         condition=arrays.condition,
     )
     with storage.lock(folder):
-        calibration.write(folder, found, model.config.inputs, data)
+        calibration_file.write(folder, found, model.config.inputs, data)
     return model._replace(calibration=found)

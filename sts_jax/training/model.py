@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from sts_jax import mvae, statespace, storage
-from sts_jax.training import calibration, manifest
+from sts_jax.training import calibration_file, manifest
 from sts_jax.training.checkpoint import Weights, read, verified
 from sts_jax.training.learners import Config, learner
 
@@ -87,7 +87,7 @@ def _load(workdir: Path) -> Model:
         ) from error
     weights = read(checkpoint, like)
     graphdef = nnx.graphdef(nnx.eval_shape(lambda: _module(model)))
-    own = calibration.read(workdir)
+    own = calibration_file.read(workdir)
     state = nnx.merge_state(weights.params, weights.stats)
     return Model(model, graphdef, state, int(weights.step), settings, None if own is None else own[0])
 

@@ -1,17 +1,14 @@
 """The preprocessing of measurements for the networks, which is stored with every model."""
 
 import dataclasses
-import io
 import json
-from pathlib import Path
 from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8
 
-from sts_jax import geometry, storage
-from sts_jax.training import manifest
+from sts_jax import geometry
 
 # The contact test of noisy images. It has the same values as the contact test of the collection of recordings
 # (`hardware.GuideConfig`).
@@ -183,58 +180,6 @@ def _block_means(images: Any, side: int) -> Any:
         return images
     height, width = images.shape[-3] // side, images.shape[-2] // side
     return images.reshape(*images.shape[:-3], height, side, width, side, 3).mean((-4, -2))
-
-
-def save_blank(folder: Path, visual: np.ndarray, tactile: np.ndarray) -> None:
-    """Write the images of the empty sensor to `folder/blank.npz`. An existing file is not changed.
-
-    Args:
-        folder: Folder of the model.
-        visual: Visual image, uint8 `(height, width, 3)`.
-        tactile: Tactile image, uint8 `(height, width, 3)`.
-
-    Raises:
-        OSError: The file cannot be written, or the manifest of the model is damaged.
-    """
-    path = folder / "blank.npz"
-    new = not path.exists()
-    if new:
-        storage.write_arrays(path, {"visual": visual, "tactile": tactile})
-    listed = manifest.read(folder)
-    if listed is not None and (new or path.name not in listed.files):
-        manifest.add(folder, path.name)
-
-
-def load_blank(folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read the images of the empty sensor from `folder/blank.npz`.
-
-    Args:
-        folder: Folder of the model.
-
-    Returns:
-        The visual and the tactile image, uint8 `(height, width, 3)`.
-
-    Raises:
-        FileNotFoundError: The file is missing.
-        DamagedFileError: The file is damaged.
-    """
-    path = folder / "blank.npz"
-    if not path.exists():
-        raise FileNotFoundError(
-            f"{path} is missing: start the training again, or write the file with training.save_blank."
-        )
-    try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as arrays:
-            images = arrays["visual"], arrays["tactile"]
-        if any(image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 for image in images):
-            found = ", ".join(f"{image.dtype} {image.shape}" for image in images)
-            raise ValueError(f"the images are {found}, but they must be uint8 (height, width, 3)")
-    except Exception as error:  # zipfile, zlib and NumPy raise many types for damaged archives
-        raise storage.DamagedFileError(
-            f"{path} is damaged ({type(error).__name__}: {error}): delete it and start the training again, which "
-            "writes the file anew."
-        ) from error
-    return images
 
 
 def preprocessing_from_json(content: dict) -> Preprocessing:
