@@ -16,7 +16,6 @@ fit. To fit your own image, call `descend` with a function that calls `slope` wi
 import dataclasses
 import functools
 import time
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -281,6 +280,5 @@ def main(config: Config) -> None:
 
 if __name__ == "__main__":
     sts.enable_compilation_cache()
-    warnings.formatwarning = lambda message, *_, **__: f"note: {message}\n"
     with on_one_line():
         main(tyro.cli(Config, description=__doc__))

@@ -17,10 +17,8 @@ and releases. At the first start, the compilation takes about two minutes for a 
 import collections
 import contextlib
 import dataclasses
-import signal
 import tempfile
 import time
-import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Literal
@@ -342,11 +340,6 @@ def main(config: Config) -> None:
             raise SystemExit("stopped") from None
 
 
-def _terminated(*_: object) -> None:
-    raise KeyboardInterrupt  # so that files are closed, as after Ctrl+C
-
-
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, _terminated)
-    warnings.formatwarning = lambda message, *_, **__: f"note: {message}\n"
+    errors.interrupt_on_sigterm()
     main(tyro.cli(Config, description=__doc__))

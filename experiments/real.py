@@ -27,11 +27,8 @@ into `WORKDIR/dataset`. Confirmed trajectories survive an interruption. After an
 continues with the next trajectory.
 """
 
-import argparse
 import dataclasses
-import signal
 import sys
-import warnings
 from collections.abc import Sequence
 from typing import Annotated
 
@@ -40,6 +37,7 @@ import tyro
 import sts_jax as sts
 from experiments.shared import errors
 from experiments.shared.collecting import Collect, collect
+from experiments.shared.command import chosen_preset
 from experiments.shared.recorded import Config
 from experiments.shared.reviewing import Review, review
 from experiments.shared.table2_command import Train, learn
@@ -65,11 +63,8 @@ def parse(words: Sequence[str]) -> Train | Collect | Review:
     """Read the options of the command line. Without a sub-command, `train` is used."""
     if not words or (words[0].startswith("-") and words[0] not in ("-h", "--help")):
         words = ["train", *words]
-    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    first.add_argument("--preset", nargs="?")
-    preset = PRESETS.get(first.parse_known_args(list(words))[0].preset, DEFAULT)  # tyro reports an unknown name
     return tyro.cli(
-        Annotated[Train, tyro.conf.subcommand("train", default=Train(preset))]
+        Annotated[Train, tyro.conf.subcommand("train", default=Train(chosen_preset(PRESETS, words)))]
         | Annotated[Collect, tyro.conf.subcommand("collect")]
         | Annotated[Review, tyro.conf.subcommand("review")],
         args=words,
@@ -92,12 +87,7 @@ def main(config: Train | Collect | Review) -> None:
             raise SystemExit("stopped") from None
 
 
-def _terminated(*_: object) -> None:
-    raise KeyboardInterrupt  # pending images are then written, as after Ctrl+C
-
-
 if __name__ == "__main__":
     sts.enable_compilation_cache()
-    signal.signal(signal.SIGTERM, _terminated)
-    warnings.formatwarning = lambda message, *_, **__: f"note: {message}\n"
+    errors.interrupt_on_sigterm()
     main(parse(sys.argv[1:]))

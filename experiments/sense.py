@@ -13,7 +13,6 @@ import dataclasses
 import functools
 import math
 import time
-import warnings
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -287,6 +286,5 @@ def main(config: Config) -> None:
 
 if __name__ == "__main__":
     sts.enable_compilation_cache()
-    warnings.formatwarning = lambda message, *_, **__: f"note: {message}\n"
     with errors.on_one_line():
         main(tyro.cli(Config, description=__doc__))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import warnings
 from pathlib import Path
 
 import pytest
@@ -292,6 +293,18 @@ def test_a_refusal_is_one_line(refused, tmp_path):
 def test_an_error_of_the_program_keeps_its_traceback(fault, kind):
     with pytest.raises(kind), errors.on_one_line():
         fault()
+
+
+def test_a_warning_is_one_line_and_later_warnings_are_as_before():
+    def formatted():
+        return warnings.formatwarning("the mesh has a hole", UserWarning, "file.py", 1, "")
+
+    usual = formatted()
+    with errors.on_one_line():
+        assert formatted() == "note: the mesh has a hole\n"
+    with pytest.raises(SystemExit), errors.on_one_line():
+        raise ValueError
+    assert formatted() == usual
 
 
 def test_a_second_run_in_a_work_directory_is_refused(tmp_path):

@@ -6,7 +6,7 @@ import pytest
 
 from experiments import freefall, inclined, perturbed, released
 from experiments.shared import config, stages
-from sts_jax import dataset
+from sts_jax import dataset, training
 
 PRESETS = {
     f"{experiment.__name__}-{name}": preset
@@ -60,6 +60,12 @@ def test_image_sizes_divide_the_resolution_and_suit_the_networks(model, side, si
             r"collection\.crop is True, but it must be False .*: give --collection\.no-crop, or --model paper",
         ),
         ({"model": "paper", "steps": (5,)}, r"steps must have 4 numbers, got \(5,\): .* each model \(mvae, "),
+        (
+            {"state_training": training.TrainConfig(steps=100, warmup=150, schedule="cosine")},
+            r"state_training\.warmup must be smaller than state_training\.steps \(100\), got 150: give --state-",
+        ),
+        ({"rerolls": 0}, "rerolls must be >= 1, got 0"),
+        ({"num_samples": -1}, "num_samples must be >= 1, got -1"),
         ({"splits": ("frame",)}, r"splits must be one or more of object, trajectory, got \('frame',\)"),
         ({"splits": ()}, r"splits must be one or more of object, trajectory, got \(\)"),
     ],

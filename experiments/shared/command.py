@@ -2,9 +2,10 @@
 
 import argparse
 import dataclasses
-from collections.abc import Mapping
+import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 import tyro
 
@@ -16,6 +17,7 @@ from experiments.shared.progress import say
 from sts_jax import dataset, storage
 from sts_jax.compilation import cache_folder
 
+Preset = TypeVar("Preset")  # type of a configuration
 LEAST_OBJECTS = 10  # smallest number of usable objects in a folder, so that some can be used for validation and test
 
 
@@ -95,10 +97,7 @@ def parse(presets: Mapping[str, Config], workdir: str, description: str | None) 
         workdir: Default of `--workdir`.
         description: Text for `--help`.
     """
-    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    first.add_argument("--preset", nargs="?")
-    name = first.parse_known_args()[0].preset
-    preset = presets.get(name, presets["default"])  # tyro reports an unknown name
+    preset = chosen_preset(presets, sys.argv[1:])
     default = Args(Path(workdir), preset)
     args = tyro.cli(Args, default=default, description=description, config=(tyro.conf.AvoidSubcommands,))
     for model, field in (("paper", "training"), ("statespace", "state_training")):
@@ -106,6 +105,19 @@ def parse(presets: Mapping[str, Config], workdir: str, description: str | None) 
             option = f"--{field.replace('_', '-')}"
             say(f"note: {option}.* has no effect, because --model {args.config.model} is trained")
     return args
+
+
+def chosen_preset(presets: Mapping[str, Preset], words: Sequence[str]) -> Preset:
+    """Find the preset that `--preset` selects, or `default`.
+
+    Args:
+        presets: Presets by name. The name `default` must be among them.
+        words: Words of the command line.
+    """
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    first.add_argument("--preset", nargs="?")
+    name = first.parse_known_args(list(words))[0].preset
+    return presets.get(name, presets["default"])  # tyro reports an unknown name
 
 
 def configure(args: Args) -> Config:

@@ -1,7 +1,10 @@
-"""How the commands report errors."""
+"""Reports of errors and warnings by the commands, and their end after a signal."""
 
 import contextlib
+import signal
+import warnings
 from collections.abc import Iterator
+from typing import Any
 
 from sts_jax import hardware
 from sts_jax.storage import LockedError
@@ -23,15 +26,34 @@ CORRECTABLE = (
 def on_one_line(*, debug: bool = False) -> Iterator[None]:
     """If the user can correct an error of the `with` block, print `error: ...` on one line, and exit with code 1.
 
+    A warning in the `with` block is printed as `note: ...` on one line.
+
     Args:
         debug: If True, raise all errors unchanged, so that Python prints their tracebacks.
 
     Raises:
         SystemExit: `debug` is False, and an error of one of the types in CORRECTABLE occurred.
     """
+    usual, warnings.formatwarning = warnings.formatwarning, _note
     try:
         yield
     except CORRECTABLE as error:
         if debug:
             raise
         raise SystemExit(f"error: {error}") from None
+    finally:
+        warnings.formatwarning = usual
+
+
+def _note(message: Warning | str, *_: Any, **__: Any) -> str:
+    """Format a warning."""
+    return f"note: {message}\n"
+
+
+def interrupt_on_sigterm() -> None:
+    """Raise a `KeyboardInterrupt` when the process receives SIGTERM, so that files are written as after Ctrl+C."""
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGTERM, interrupt)
