@@ -37,6 +37,7 @@ SCENARIOS: dict[str, physics.Scenario] = {
     "freefall": physics.Freefall(),
     "inclined": physics.Inclined(),
     "perturbed": physics.Perturbed(),
+    "released": physics.Released(),
 }
 NUM = 8  # trajectories of each object
 BLOCK = 504  # trajectories simulated by one call, unless fewer are requested
@@ -51,7 +52,7 @@ class Args:
     """
 
     num: int = 10_000  # number of trajectories of each scenario
-    only: Literal["freefall", "inclined", "perturbed"] | None = None  # the only scenario to simulate (default: all)
+    only: Literal["freefall", "inclined", "perturbed", "released"] | None = None  # the only scenario to simulate (default: all)
     first_block: int = 0  # number of the first block, from 0. Earlier blocks are skipped
     keep: Path | None = None  # folder that keeps finished blocks (default: a temporary folder)
 

@@ -199,7 +199,7 @@ def load(config: Config) -> tuple[Side, Side]:
 
 
 def report(real: Side, simulated: Side, *, matched: bool) -> str:
-    """The text that is printed: the sources and the table of distances."""
+    """Make the text that the command prints: the sources of the images, and a table of the measured differences."""
     number = len(np.unique(real.images.group))
     head = f"matched by number: {number} trajectories" if matched else "not matched"
     lines = [f"real:      {real.described}", f"simulated: {simulated.described}", head, ""]
@@ -214,7 +214,7 @@ def report(real: Side, simulated: Side, *, matched: bool) -> str:
 
 
 def measured(real: gap.Streams, simulated: gap.Streams, stream: str, *, matched: bool) -> dict[str, str]:
-    """The distances between the real and the simulated images of one stream, as texts by name."""
+    """Compare the real and the simulated images of one stream, and return the name and the text of each measure."""
     first, second = getattr(real, stream), getattr(simulated, stream)
     rows = {}
     if matched:
@@ -235,7 +235,7 @@ def measured(real: gap.Streams, simulated: gap.Streams, stream: str, *, matched:
 
 
 def written(estimate: gap.Estimate, digits: int) -> str:
-    """An estimate and its interval as text."""
+    """Format an estimate and the limits of its 95 % interval as text."""
     return f"{estimate.value:.{digits}f} [{estimate.low:.{digits}f}, {estimate.high:.{digits}f}]"
 
 

@@ -1,4 +1,4 @@
-"""Predict images of the object at rest from live images about ten times a second, and show live and predicted images.
+"""Predict images of the object at rest from the live images of a sensor, and show the live and the predicted images.
 
     python -m experiments.live                                            # starts a digital twin and opens a page
     python -m experiments.live --sensor bench                             # the sensor of a sensor file
@@ -8,8 +8,10 @@
     python -m experiments.live --replay visual.mp4 tactile.mp4 --sensor bench
     python -m experiments.live --headless --seconds 20 --save live.png    # without a page
 
-The page shows the newest visual and tactile image, the predicted images of the object at rest, and the probabilities of
-the outcomes. The page also shows whether the object touches the pad, and the rate and the latency of the predictions.
+The command makes about ten predictions a second. The page shows the newest visual and tactile image, the predicted
+images of the object at rest, and the probability of each outcome, such as "topples" or "fell off". The page also shows
+whether the object touches the pad, and the rate and the latency of the predictions.
+
 The default model was trained only on simulated objects of the class `camera`, which are small cameras that a hand holds
 and releases. At the first start, the compilation takes about two minutes for a twin and half a minute for the model.
 """
@@ -94,7 +96,7 @@ def check(config: Config) -> None:
     """Check the options before any work.
 
     Raises:
-        ValueError: Two options contradict each other, or one is out of range.
+        ValueError: Two options contradict each other, an option is missing or out of range, or there is no sensor file.
     """
     given = [
         name

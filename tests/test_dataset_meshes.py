@@ -124,7 +124,7 @@ def test_a_file_deleted_after_the_survey_is_left_out(folder: Path, tmp_path_fact
     made = dataset.collect(one, sts.Sensor(), out)
     (line,) = made.left_out
     assert line.startswith("object 4 (can/1.stl): ")
-    assert "no longer has the mesh files can/1.stl" in line
+    assert "no longer has can/1.stl: restore" in line
     np.testing.assert_array_equal(dataset.load(out).trajectory["body"], [0, 1, 2, 3, 5])
 
 

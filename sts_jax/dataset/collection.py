@@ -134,7 +134,9 @@ def make_bodies(collection: Collection, indices: np.ndarray) -> list[objects.Bod
         chosen = [collection.meshes.names[i] for i in indices]
         gone = [name for name in chosen if name not in where]
         if gone:
-            raise FileNotFoundError(f"{library.folder} no longer has the mesh files {', '.join(gone)}: put them back")
+            raise FileNotFoundError(
+                f"{library.folder} no longer has {', '.join(gone)}: restore every missing mesh file"
+            )
         return [objects.read(library, where[name]).body for name in chosen]
     key, names = jax.random.key(collection.seed), class_names(collection)
     bodies = [objects.make(jax.random.fold_in(key, int(i)), names[i]) for i in indices]
@@ -144,7 +146,7 @@ def make_bodies(collection: Collection, indices: np.ndarray) -> list[objects.Bod
 
 
 def head(collection: Collection, count: int) -> Collection:
-    """A copy of the collection that has only its first `count` objects."""
+    """Return a copy of the collection with only the first `count` objects."""
     meshes = collection.meshes
     if meshes is None:
         return dataclasses.replace(collection, num_objects=count)

@@ -64,10 +64,10 @@ class Views(NamedTuple):
 
 
 def reduced(pairs: Pairs, size: int) -> Pairs:
-    """Reduce the images of pairs to a lower resolution. Each new pixel is the mean of a square block of pixels.
+    """Reduce the images in `pairs` to a lower resolution. Each new pixel is the mean of a square block of pixels.
 
     Args:
-        pairs: Pairs with square images.
+        pairs: First and last frames of trajectories, with square images.
         size: New side length of the images (pixels). It must divide the present side length.
 
     Returns:
@@ -120,7 +120,10 @@ def _means(images: np.ndarray, size: int) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class Dataset:
-    """A dataset of `num` trajectories, opened by `load`. Images are read on request. All other data are in memory."""
+    """A dataset that `load` has opened. Images are read on request. All other data are in memory.
+
+    In the shapes of the fields, num is the number of trajectories.
+    """
 
     collection: dict  # content of collection.json
     identity: str  # SHA-256 of all collected data and of the split
@@ -272,7 +275,7 @@ class Dataset:
         if trajectories.ndim != 1 or (trajectories.size and trajectories.dtype.kind not in "iu"):
             raise ValueError(
                 f"`trajectories` has the type {trajectories.dtype} and the shape {trajectories.shape}, but it must be "
-                "a list of whole numbers: convert a Boolean mask to indices with np.flatnonzero(mask)."
+                "a one-dimensional array of integers. If it is a Boolean mask, give np.flatnonzero(mask) instead."
             )
         outside = trajectories[(trajectories < 0) | (trajectories >= count)]
         if outside.size:

@@ -119,7 +119,7 @@ def _same(one: np.ndarray, other: np.ndarray) -> bool:
 
 
 def mesh_classes(folder: str | os.PathLike[str]) -> tuple[str, ...]:
-    """List the classes of the mesh files in a folder, without opening a file.
+    """List the classes of the mesh files in a folder, without opening a mesh.
 
     Args:
         folder: Folder of mesh files with one sub-folder per class, or folder of the dataset ShapeNetSem (see
@@ -134,10 +134,10 @@ def mesh_classes(folder: str | os.PathLike[str]) -> tuple[str, ...]:
 
 @functools.lru_cache
 def open_library(meshes: Meshes, parts: bool) -> tuple[objects.Library, dict[str, int]]:
-    """Open the folder of some mesh files as an `objects.Library`, a list of objects.
+    """Make an `objects.Library` of all mesh files in the folder `meshes.folder`, without opening a mesh.
 
     Args:
-        meshes: The mesh files.
+        meshes: Mesh files that `survey_meshes` returned. The library contains all other files of their folder too.
         parts: True to split an object into convex parts if its convex hull reaches more than 2 mm beyond its surface.
 
     Returns:
