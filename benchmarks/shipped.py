@@ -4,11 +4,11 @@
     python -m benchmarks.shipped perturbed --trained runs/perturbed/models/statespace    # another trained model
 
 The outcome of a trajectory is the event that happens to the object, such as falling off. An experiment has few held-out
-objects, so the intervals of the outcome metrics in the experiment's table are wide. This command draws new objects from
-the distribution of the experiment, and simulates and renders four trajectories of each object. The command prints
-metrics of the shipped model, and the relative reduction of the outcome's log loss if the model sees the tactile image
-in addition to the visual image. It also draws 16 samples of each prediction, and prints metrics of the samples, such as
-the sharpness.
+objects, so the confidence intervals of the outcome metrics in the experiment's table are wide. This command draws new
+objects from the distribution of the experiment, and simulates and renders four trajectories of each object. The command
+prints metrics of the shipped model, and the relative reduction of the outcome's log loss if the model sees the tactile
+image in addition to the visual image. It also draws 16 samples of each prediction, and prints metrics of the samples,
+such as the sharpness.
 
 The calibration error of few trajectories is above 0 even if the probabilities are exact. The command therefore also
 draws outcomes from the model's own probabilities, and prints the calibration error for these outcomes.
@@ -65,7 +65,11 @@ class Args:
 
 
 def collection(args: Args) -> dataset.Collection:
-    """The collection of the model's experiment, with new objects, of which none are for training or validation."""
+    """Description of a dataset with new objects for the model's experiment.
+
+    The training split contains a fifth of the objects, which are only used for the baselines and as a reference for
+    the metrics. The test split contains the other objects. The validation split is empty.
+    """
     return dataclasses.replace(
         EXPERIMENTS[args.model].COLLECTION,
         num_objects=args.objects,
@@ -95,8 +99,8 @@ def main(args: Args) -> str:
 
     Raises:
         FileNotFoundError: The folder `--trained` contains no model.
-        ValueError: There are fewer than 5 objects, the work directory has the trajectories of other options, or the
-            model in `--trained` is not a state-space model of the experiment's scenario.
+        ValueError: There are fewer than 5 objects, the work directory has trajectories from a run with other options,
+            or the model in `--trained` is not a state-space model of the experiment's scenario.
     """
     if args.objects < 5:
         raise ValueError(

@@ -5,11 +5,14 @@
     python -m benchmarks.soak --keep FOLDER              # keep finished blocks in a folder, and resume from it
     python -m benchmarks.soak --first-block 17           # skip blocks 0 to 16, if another machine runs these blocks
 
-A new object is made for every eight trajectories. The classes of the objects take turns, except on the jerked pad,
-where all objects are bottles. The command counts outcomes, unsettled trajectories, and trajectories that `simulate`
-discarded and drew again, because they were not finite or because the object sank deeper into the pad than the limit.
-It compares the wrench at rest with the weight, and the energy in frames without contact with the energy at the start.
-All results are printed.
+A new object is made for every eight trajectories. Objects of all classes are made in turn, except in the scenario
+`perturbed` (the jerked pad), where all objects are bottles. The command counts the outcomes and the unsettled
+trajectories. A trajectory is unsettled if the object is neither at rest nor off the pad at the end. The command also
+counts the trajectories that `simulate` discarded and drew again, because they were not finite or because the object
+sank deeper into the pad than `physics.simulation.SUNK_LIMIT`.
+
+The command compares the wrench at rest with the weight, and the energy in frames without contact with the energy at
+the start. All results are printed.
 
 The trajectories are simulated in blocks of 504, or of fewer if fewer are requested. `benchmarks.hidden --soaked FOLDER`
 analyses the blocks that `--keep FOLDER` has kept.
@@ -52,7 +55,8 @@ class Args:
     """
 
     num: int = 10_000  # number of trajectories of each scenario
-    only: Literal["freefall", "inclined", "perturbed", "released"] | None = None  # the only scenario to simulate (default: all)
+    # the only scenario to simulate (default: all)
+    only: Literal["freefall", "inclined", "perturbed", "released"] | None = None
     first_block: int = 0  # number of the first block, from 0. Earlier blocks are skipped
     keep: Path | None = None  # folder that keeps finished blocks (default: a temporary folder)
 
@@ -150,8 +154,9 @@ def soaked(folder: Path, name: str) -> Starts:
         name: Name of the scenario, in SCENARIOS.
 
     Returns:
-        The starts and outcomes. The field `rerolled` is for second simulations of the same starts with other contents
-        of the objects. All values of this field are -1, because this benchmark simulates no start twice.
+        The starts and outcomes. In other benchmarks, the field `rerolled` is the outcome of a second simulation from
+        the same start with other contents of the object. Here, all values of `rerolled` are -1, because this benchmark
+        simulates each start only once.
 
     Raises:
         FileNotFoundError: The folder has no blocks.
@@ -177,7 +182,7 @@ def report(name: str, found: dict[str, np.ndarray]) -> str:
 
     Args:
         name: Name of the scenario.
-        found: Arrays of `block`, of all blocks together.
+        found: Arrays that `block` returns, concatenated over all blocks.
     """
     outcome = found["outcome"]
     shares = {o.name.lower(): np.mean(outcome == o) for o in SCENARIOS[name].outcomes}

@@ -3,9 +3,10 @@
     python -m benchmarks.touch          # about a minute, for the dataset of runs/freefall
     python -m benchmarks.touch FOLDER   # another dataset of procedural objects of all classes
 
-A ridge regression of the logarithm of the mass on simple features of the image (sums, size and depth of the imprint) is
-fitted to the training objects. The command uses the last images of objects that rest on the pad. It prints the accuracy
-on held-out objects, and the share of imprint pixels that are saturated, at 0 or 255. It writes no files.
+A ridge regression of the logarithm of the mass on simple features of the image is fitted to the training objects. The
+features are the summed darkness of the imprint, its largest darkness and its number of pixels. The command uses the last
+images of objects that rest on the pad. It prints the accuracy on held-out objects, and the share of imprint pixels that
+are saturated, at 0 or 255. It writes no files.
 """
 
 import dataclasses
@@ -26,7 +27,10 @@ class Args:
 
 
 def features(tactile: np.ndarray, blank: np.ndarray) -> np.ndarray:
-    """Simple features of tactile images: sums, size and depth of the imprint.
+    """Compute features of the imprint in each image: its summed and largest darkness, and its number of pixels.
+
+    The darkness of a pixel is -log(value / value in `blank`). The sums and the number of pixels enter as logarithms,
+    together with the squares and one product of these logarithms.
 
     Args:
         tactile: Tactile images, uint8 `(n, h, w, 3)`.

@@ -2,10 +2,11 @@
 
     python -m benchmarks.twin
 
-Prints, for each size, the time to render a pose, the time to make a noisy frame with the light on for half of the
-exposure, and the time to encode this frame as JPEG. With the light off, it also prints how many frames per second the
-twin makes on its virtual clock, which does not wait for real time, and how many frames per second a second process
-receives through OpenCV. All values are medians, and all processes run on one CPU core.
+For each size, the command prints the time to render a pose, the time to make a noisy frame with the light on for half
+of the exposure, and the time to encode this frame as JPEG. The command also prints two frame rates, which are measured
+with the light off. The first is the rate at which the twin makes frames on its virtual clock, which does not wait for
+real time. The second is the rate at which a second process receives frames through OpenCV. All values are
+medians, and all processes run on one CPU core.
 """
 
 import dataclasses
@@ -60,7 +61,9 @@ def timed(call: Callable[[], object], number: int) -> float:
 
 
 def held(size: tuple[int, int], exposure_s: float) -> tuple[twin.Twin, twin.ObjectScene]:
-    """Make a twin with a lens of 160 degrees, and the twin's scene: an object of the class "camera" on the pad.
+    """Make a twin whose lens has a field of view of 160 degrees, and a scene with an object of the class "camera".
+
+    The pad is empty until the twin receives the command `hold`, which places the object on the pad.
 
     Args:
         size: Height and width of the frames (pixels).

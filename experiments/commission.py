@@ -1,13 +1,14 @@
 """Commission a real sensor: measure its camera, lights and lens, and write the sensor file.
 
     python -m experiments.commission                                    # list cameras and serial ports
-    python -m experiments.commission --print-board board.pdf            # the board to print
+    python -m experiments.commission --print-board board.pdf            # write the calibration board
     python -m experiments.commission --camera /dev/video0 --leds /dev/ttyACM0 --out bench
 
-The command finds the exposure of each stream, measures the time from a change of the lights to the first frame that
-shows only the new lights, records images of the empty pad, and calibrates the lens from pictures of the board. The
-command writes OUT/sensor.json, which `Sensor.load` and `hardware.STS.from_file` read. Pictures of the board are kept in
-OUT/board, so the same command continues after an interruption.
+The command chooses one exposure for the visual images (lights off) and one for the tactile images (lights on). It
+measures the time from a change of the lights to the first frame that shows only the new lights, records images of the
+empty pad, and calibrates the lens from pictures of the printed calibration board. The command writes OUT/sensor.json,
+which `Sensor.load` and `hardware.STS.from_file` read. Pictures of the board are kept in OUT/board, so the same command
+continues after an interruption.
 """
 
 import contextlib
@@ -34,7 +35,7 @@ V4L2_UNIT = 1e-4  # unit of the exposure of a Video4Linux device (s)
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Options of the command line: devices, output folder, and a calibrated lens or an assumed ideal lens."""
+    """Options of the command line: the devices, the output folder, and whether to calibrate the lens or assume one."""
 
     camera: str | None = None  # path of the camera, such as /dev/v4l/by-id/..., or URL. None: list cameras and stop
     leds: str | None = None  # serial port of the LED controller, such as /dev/ttyACM0. None: list ports and stop
@@ -180,7 +181,8 @@ def ideal(config: Config, pinhole: hardware.Pinhole) -> hardware.Lens:
     """Make the lens of `--ideal-lens`, which is assumed to be without error.
 
     Raises:
-        CalibrationError: The raw image of this lens does not contain the whole view of the sensor.
+        CalibrationError: The raw image of this lens does not contain the whole view of the sensor. The view is the part
+            of the gel's outer face that rectified images show.
     """
     assert config.ideal_lens is not None
     lens = hardware.Lens.ideal(
@@ -197,7 +199,8 @@ def fit(pictures: boards.Pictures, pinhole: hardware.Pinhole) -> hardware.Lens:
     """Calibrate the lens from pictures of the board, and print the error of each picture.
 
     Raises:
-        CalibrationError: The pictures do not determine the lens, or the lens does not cover the view of the sensor.
+        CalibrationError: The pictures do not determine the lens, or the lens or the pictures do not cover the view of
+            the sensor. The view is the part of the gel's outer face that rectified images show.
     """
     say(f"board: {len(pictures.names)} pictures in {pictures.folder}, {pictures.describe()}")
     calibration = pictures.fit(pinhole)
@@ -231,8 +234,8 @@ def live(config: Config, sensor: hardware.STS, pinhole: hardware.Pinhole) -> har
         return fit(pictures, pinhole)
     except hardware.CalibrationError as error:
         raise hardware.CalibrationError(
-            f"{error} The pictures are kept in {folder}: delete those that are listed as bad, "
-            "and run the command again to take others in their place. To add pictures, give a larger --pictures than "
+            f"{error} The pictures are kept in {folder}. If this message names bad pictures, delete them, and run the "
+            "command again to take new ones. To add pictures, run the command again with --pictures larger than "
             f"{config.pictures}."
         ) from error
 
@@ -345,5 +348,5 @@ if __name__ == "__main__":
     except KeyboardInterrupt:
         number = len(list((arguments.out / "board").glob("*.png")))
         raise SystemExit(
-            f"interrupted: {number} pictures of the board are kept. Run the command again to continue"
+            f"interrupted. Number of kept pictures of the board: {number}. Run the command again to continue"
         ) from None

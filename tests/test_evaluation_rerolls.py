@@ -9,8 +9,7 @@ from test_evaluation_scores import pairs
 import sts_jax as sts
 from sts_jax import dataset, evaluation, physics
 from sts_jax.evaluation import rerolls
-from sts_jax.physics.bodies import shapes
-from sts_jax.physics.draws import draw
+from sts_jax.physics.arguments import check_start
 
 TIMES, SIDE = 3, 4
 COLLECTION = dataset.Collection(physics.Freefall(), num_objects=2, num_per_object=2, resolution=(2 * SIDE, 2 * SIDE))
@@ -29,17 +28,16 @@ def starts():
 
 @pytest.fixture
 def engine(monkeypatch):
-    """Replace the simulation by ends above or below the starts that `simulate` draws.
+    """Replace the simulation by ends above or below the starts that `simulate` receives.
 
     The grey value of a picture depends on the object and on z. Pictures are twice as large as those of the items.
     """
     seen = {}
 
-    def simulate(key, bodies, sensor, scenario, num, *, engine, progress):
+    def simulate(key, bodies, sensor, scenario, num, *, start, engine, progress):
         which, nth = np.repeat(np.arange(len(bodies)), num), np.tile(np.arange(num), len(bodies))
-        pad = tuple(float(side) for side in sensor.gel.size)
-        start, hidden = draw(key, which, nth, 0 * nth, shapes(bodies, scenario), scenario=scenario, pad=pad)
-        seen.update(bodies=bodies, held=start.held, hidden=hidden)
+        start = check_start(start, scenario, len(which))
+        seen.update(bodies=bodies, start=start)
         pose = jnp.stack([start.pose, start.pose + jnp.zeros(7).at[2].set(1) * OFF_FIRST[nth][:, None]], 1)
         nothing = jnp.zeros((len(which), 2, 6))
         rest = dict.fromkeys(physics.Trajectory._fields)
@@ -65,8 +63,8 @@ def test_every_reroll_begins_at_the_start_of_its_item_and_its_end_is_a_sample(en
         expected[:, 2] += off
         np.testing.assert_allclose(found.samples.pose[number], expected, atol=1e-6)
     np.testing.assert_allclose(found.pose[:, :3], test.pose[:, 0, :3], atol=1e-4)  # the median of -1, 0 and 1 m
-    assert (np.asarray(engine["held"]) == COLLECTION.scenario.steps).all()
-    assert len(np.unique(np.asarray(engine["hidden"].fill))) == 3 * TIMES
+    assert (np.asarray(engine["start"].held) == COLLECTION.scenario.steps).all()  # released at rest in frame 0
+    assert not np.asarray(engine["start"].carried).any()
     # Each item is drawn with its own object: the first body of the engine is object 1.
     assert found.samples.tactile.shape == (TIMES, 3, SIDE, SIDE, 3)
     ends = 100 + 50 * found.samples.pose[..., 2]
@@ -76,13 +74,6 @@ def test_every_reroll_begins_at_the_start_of_its_item_and_its_end_is_a_sample(en
     rests = [outcome == physics.Outcome.RESTS for outcome in COLLECTION.scenario.outcomes]
     np.testing.assert_allclose(found.outcome_probability[:, rests.index(True)], 2.5 / 4)
     assert found.outcome.tolist() == [physics.Outcome.RESTS] * 3
-
-
-def test_another_start_than_that_of_the_item_is_refused(engine, monkeypatch):
-    real = rerolls.physics.simulate
-    monkeypatch.setattr(rerolls.physics, "simulate", lambda key, *rest, **k: real(jax.random.key(9), *rest, **k))
-    with pytest.raises(RuntimeError, match="first pose of a re-roll differs"):
-        evaluation.ceiling(COLLECTION, sts.Sensor(), starts(), TIMES, jax.random.key(0))
 
 
 def test_at_least_one_reroll_is_required():

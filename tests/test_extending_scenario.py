@@ -221,14 +221,11 @@ def test_the_stages_of_an_experiment_train_and_evaluate_a_new_scenario(page, nam
     assert any(title.startswith("state-space model") for title in summary["predictors"])
 
 
-def test_re_rolls_begin_with_the_velocity_of_the_condition(page):
-    from sts_jax.evaluation import rerolls
-
-    scenario = page["Rolled"](frames=4)
-    bodies = [page["bottle"]]
-    first = physics.simulate(jax.random.key(3), bodies, sts.Sensor(), scenario)
-    again = rerolls._replayed(scenario, np.asarray(first.pose[:, 0]), np.asarray(first.condition), 2, jax.random.key(4))
-    found = physics.simulate(jax.random.key(4), bodies, sts.Sensor(), again, 2)
-    np.testing.assert_allclose(found.velocity[:, 0], np.tile(first.velocity[:, 0], (2, 1)), atol=1e-6)
-    np.testing.assert_allclose(found.pose[:, 0], np.tile(first.pose[:, 0], (2, 1)), atol=1e-6)
-    assert np.all(geometry.norm(found.velocity[:, 0, :2]) > 0.04)
+def test_a_given_start_has_the_velocity_of_its_condition(page):
+    scenario, bodies = page["Rolled"](frames=4), [page["bottle"]]
+    first = physics.simulate(jax.random.key(3), bodies, sts.Sensor(), scenario, 2)
+    start = physics.Start(first.pose[:, 0], jnp.asarray(scenario.steps), first.condition)
+    again = physics.simulate(jax.random.key(4), bodies, sts.Sensor(), scenario, 2, start=start)
+    np.testing.assert_allclose(again.velocity[:, 0], first.velocity[:, 0], atol=1e-6)
+    np.testing.assert_allclose(again.pose[:, 0], first.pose[:, 0], atol=1e-6)
+    assert np.all(geometry.norm(again.velocity[:, 0, :2]) > 0.04)

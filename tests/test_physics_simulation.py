@@ -267,6 +267,22 @@ def test_given_hidden_values_keep_the_starts_and_nothing_is_printed_by_default(
     assert not np.any(np.all(other.pose[1:, -1] == drops.pose[1:NUM, -1], axis=1))
 
 
+def test_given_starts_and_hidden_values_repeat_trajectories_of_another_key(
+    bodies: list[objects.Body], drops: physics.Trajectory, engine: physics.Engine
+) -> None:
+    start = physics.Start(drops.pose[:NUM, 0], jnp.asarray(SCENARIO.steps), drops.condition[:NUM])
+    hidden = jax.tree.map(lambda x: x[:NUM], drops.hidden)
+    again = physics.simulate(
+        jax.random.key(9), bodies[0], Sensor(), SCENARIO, NUM, start=start, hidden=hidden, chunk=24, engine=engine
+    )
+    np.testing.assert_array_equal(again.pose, drops.pose[:NUM])
+    other = physics.simulate(
+        jax.random.key(9), bodies[0], Sensor(), SCENARIO, NUM, start=start, chunk=24, engine=engine
+    )
+    np.testing.assert_array_equal(other.pose[:, 0], drops.pose[:NUM, 0])
+    assert not np.any(np.all(other.pose[:, -1] == drops.pose[:NUM, -1], axis=1))
+
+
 def test_objects_that_leave_the_pad_are_frozen(bodies: list[objects.Body], engine: physics.Engine) -> None:
     scenario = dataclasses.replace(SCENARIO, spread=0.15)
     drops = physics.simulate(jax.random.key(0), bodies[2], Sensor(), scenario, 24, chunk=24, engine=engine)
@@ -423,6 +439,28 @@ def test_a_traced_trajectory_prints_its_shapes(drops: physics.Trajectory) -> Non
     seen += [repr(jax.eval_shape(lambda x: x, drops)), repr(jax.tree.map(np.shape, drops))]
     assert ["pose=(24, 60, 7)" in text for text in seen] == [True, False, True, True]
     assert "pose=(60, 7)" in seen[1]
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"pose": np.zeros((3, 7))}, r"start\.pose has shape \(3, 7\), but it must be \(2, 7\)"),
+        ({"pose": np.zeros((2, 7))}, r"start\.pose has quaternions whose length is not 1"),
+        ({"pose": np.full((2, 7), np.nan)}, r"start\.pose has values that are not finite"),
+        ({"condition": np.zeros((2, 1))}, r"start\.condition has shape \(2, 1\), but it must be \(2, 0\)"),
+        ({"held": np.array(-1)}, r"start\.held is -1, but it must be whole numbers of time steps >= 0"),
+        (
+            {"held": np.zeros(3, int)},
+            r"start\.held has shape \(3,\), but it must be one number or have the shape \(2,\)",
+        ),
+        ({"carried": np.array(1.5)}, r"start\.carried has values from 1\.5 to 1\.5, but each must be from 0 to 1"),
+    ],
+)
+def test_errors_name_bad_starts(bodies: list[objects.Body], changed: dict, message: str) -> None:
+    pose = np.tile(np.float32([0, 0, 0.1, 1, 0, 0, 0]), (2, 1))
+    start = physics.Start(pose, np.array(0), np.zeros((2, 0), np.float32))._replace(**changed)
+    with pytest.raises(ValueError, match=message):
+        physics.simulate(jax.random.key(0), bodies[0], Sensor(), SCENARIO, 2, start=start)
 
 
 def test_errors_name_bad_hidden_values(bodies: list[objects.Body]) -> None:

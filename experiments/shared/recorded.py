@@ -147,7 +147,7 @@ def sensor_file(workdir: Path) -> tuple[hardware.Device, sts.Sensor]:
     """Read the sensor file of a work directory.
 
     Returns:
-        The description of the device, with the lens and the names of the background images, and the constants of the
+        The description of the device (such as the lens and the names of the background images) and the constants of the
         sensor.
 
     Raises:
@@ -178,7 +178,7 @@ def identity(workdir: Path, recordings: hardware.Recordings) -> str:
 
 
 def jobs(config: Config, data: Recorded) -> Iterator[stages.Job]:
-    """Prepare the training of each of the three models.
+    """Prepare the training of each of the three models of the paper's Table 2.
 
     Raises:
         ValueError: No initial tactile image shows a contact.
@@ -222,7 +222,9 @@ def augmented(config: Config, images: np.ndarray, empty: np.ndarray) -> np.ndarr
 
 
 def train(config: Config, data: Recorded, folder: Path) -> None:
-    """Train the three models in `folder`, and show the progress.
+    """Train the three models of the paper's Table 2, and show the progress.
+
+    Each model is stored in its own folder, such as `folder / "models" / "vae-visual"`.
 
     Raises:
         ValueError: No initial tactile image shows a contact.

@@ -1,6 +1,6 @@
 """Simulates re-rolls of held-out trajectories, and stores the scores of the re-rolls.
 
-A re-roll is a new simulation from the first pose of a trajectory, with newly drawn hidden properties.
+A re-roll is a new simulation from the first pose of a trajectory, with newly drawn hidden properties such as friction.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,10 @@ FORMAT = 2  # version of the files (2: outcomes are decided by the ratio of prob
 
 
 class Ceilings(NamedTuple):
-    """Re-rolls (new simulations) of the first held-out trajectories, and the scores of the re-rolls as predictions."""
+    """Re-rolls (new simulations) of held-out trajectories, and the scores of predictions made from the re-rolls.
+
+    The tables show the score of the mean of the re-rolls as the ceiling.
+    """
 
     scores: dict[str, evaluation.Scores]  # scores of the mean of the re-rolls, and of a single re-roll
     pose: np.ndarray  # poses at rest, shape (times, n, 7)
@@ -42,13 +45,13 @@ def ceilings(
 ) -> Ceilings:
     """Read the re-rolls of the first `num` held-out trajectories, or compute and write the re-rolls.
 
-    A re-roll is a new simulation from the first pose of a trajectory, with newly drawn hidden properties. The re-rolls
-    are in `ceiling{suffix}.npz`. `ceiling{suffix}.json` records the checksums of the inputs of the computation. If an
-    input has changed, the re-rolls are computed again.
+    A re-roll is a new simulation from the first pose of a trajectory, with newly drawn hidden properties such as
+    friction. The re-rolls are in `ceiling{suffix}.npz`. `ceiling{suffix}.json` records the checksums of the inputs of
+    the computation. If an input has changed, the re-rolls are computed again.
 
     Args:
         workdir: Work directory.
-        suffix: Suffix in the names of the files, which distinguishes several splits.
+        suffix: Suffix of the file names, different for each split of the dataset.
         collection: Collection of the experiment.
         sensor: Sensor that renders the last frames of the re-rolls.
         data: Dataset of the experiment.
@@ -86,7 +89,8 @@ def reroll(
 ) -> Ceilings:
     """Re-roll trajectories, and score the mean of the re-rolls and a single re-roll as predictions.
 
-    A re-roll is a new simulation from the first pose of a trajectory, with newly drawn hidden properties.
+    A re-roll is a new simulation from the first pose of a trajectory, with newly drawn hidden properties such as
+    friction.
 
     Args:
         collection: Collection of the experiment.

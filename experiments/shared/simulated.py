@@ -27,7 +27,7 @@ MOTION_RATE = 4.0
 
 @dataclasses.dataclass(frozen=True)
 class Simulated:
-    """Options of a collection with the twin.
+    """Options for the collection of trajectories with a digital twin of the sensor.
 
     Raises:
         ValueError: A field is out of range.
@@ -50,7 +50,7 @@ class Simulated:
 
 
 class Hand(twin.Hand):
-    """Moves the twin's object as the guide instructs, and shows the progress."""
+    """Moves the twin's object as `hardware.collect` instructs, and shows the progress of the collection."""
 
     def __init__(self, device: twin.Twin, session: hardware.Session, bar: Bar, count: int):
         super().__init__(device, session)
@@ -58,9 +58,9 @@ class Hand(twin.Hand):
         self._problem: str | None = None
 
     def show(self, view: View) -> None:
-        """Follow the instruction from `hardware.collect` in `view`.
+        """Follow the instruction from `hardware.collect` in `view`, and show the number of confirmed trajectories.
 
-        The number of confirmed trajectories is shown, and the message of a new problem.
+        If a problem has occurred since the last view, its message is shown too.
         """
         super().show(view)
         self._bar("collect", view.confirmed, self._count)
@@ -72,10 +72,11 @@ class Hand(twin.Hand):
 
 
 def collect(config: Simulated) -> None:
-    """Collect until there are `config.count` confirmed trajectories. An interrupted collection is continued.
+    """Collect trajectories until `config.count` are confirmed, or continue an interrupted collection.
 
-    The scene of the twin (`ObjectScene`) numbers the simulated trajectories, and the session numbers the recorded
-    trajectories. Both numbers of a trajectory are equal. Therefore, a continued collection repeats no trajectory.
+    The twin (`ObjectScene`) simulates a fixed sequence of trajectories for each seed. A trajectory has the same number
+    in this sequence and in the session. A continued collection starts with the next number of the session. Therefore,
+    it repeats no trajectory.
 
     Raises:
         ValueError: The work directory contains data of another sensor or with other options.
@@ -136,10 +137,13 @@ def started(config: Simulated, first: int) -> Iterator[twin.Twin]:
 
 
 def commissioned(config: Simulated, device: twin.Twin) -> tuple[twin.VirtualSensor, EmptyPad]:
-    """Make the sensor with the settling times and backgrounds of the sensor file. A missing file is written first.
+    """Make a `VirtualSensor` and an `EmptyPad` of the twin from the sensor file in the work directory.
+
+    If the file is missing, `commission` writes it first. The settling times of the sensor come from the file. The
+    `EmptyPad` is computed from the background images that the file names.
 
     Raises:
-        ValueError: The sensor file was written with another image size or with other levels.
+        ValueError: The sensor file was written with another image size or with other LED levels.
         SensorFileError: The sensor file is damaged, or belongs to another device.
     """
     file = config.workdir / hardware.sensor_file.NAME

@@ -71,20 +71,25 @@ class Site(abc.ABC):
 
     @abc.abstractmethod
     def image(self, stream: str) -> Image | None:
-        """The newest image of a stream, or None. If the image has not changed, the same object is returned again."""
+        """The newest image of a stream, or None before the first image.
+
+        If the image has not changed, the same object is returned again.
+        """
 
     def still(self, path: str) -> Image | None:
         """The single image at a path such as `end/initial/visual.jpg`, or None if there is none."""
         return None
 
     def pressed(self, content: Any) -> bool:
-        """Accept an action of the page.
+        """Accept or refuse an action of the page, such as a pressed button.
+
+        Subclasses override this method if their page has actions. `Site` itself refuses every action.
 
         Args:
             content: Decoded JSON of the request.
 
         Returns:
-            False if the action is invalid or comes too late.
+            True if the action is accepted. False if it is invalid or comes too late.
         """
         return False
 

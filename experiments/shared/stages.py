@@ -127,7 +127,7 @@ def jobs(
     Args:
         config: Configuration of the experiment.
         sensor: Sensor of the collection.
-        pairs: First and last frames of the training trajectories, with images as they were collected.
+        pairs: First and last frames of the training trajectories, with images at the resolution of the collection.
         views: Further images of the training objects. Only the state-space model uses them.
         falls: First and last poses in trajectories of the training objects, without images. Only the state-space model
             uses these poses.

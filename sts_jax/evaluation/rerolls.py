@@ -8,22 +8,16 @@ friction.
 import concurrent.futures
 import os
 from collections.abc import Callable
-from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
 from sts_jax import dataset, physics
 from sts_jax.evaluation import metrics
 from sts_jax.evaluation.outcomes import shares
 from sts_jax.evaluation.predictions import Predicted
-from sts_jax.physics.scenario import Shape, Start
-from sts_jax.physics.simulation import ATTEMPTS
 from sts_jax.sensor import Sensor
-
-_SAME = 1e-4  # largest difference between the first poses of a re-roll and its item (m, or entries of a quaternion)
 
 
 def ceiling(
@@ -64,26 +58,27 @@ def ceiling(
 
     Raises:
         ValueError: `times` is below 1.
-        RuntimeError: A re-roll did not begin in the first pose of its item, because of an error in the library.
     """
     if times < 1:
         raise ValueError(f"times must be >= 1, got {times}")
     scenario = collection.scenario
     owners, place = np.unique(test.object, return_inverse=True)
     bodies = dataset.make_bodies(collection, owners)
-    again = _replayed(scenario, test.pose[:, 0], test.condition, times, key)
-    traj = physics.simulate(
-        key, [bodies[i] for i in place], sensor, again, times, engine=collection.engine, progress=progress or False
+    start = physics.Start(
+        pose=jnp.asarray(np.repeat(test.pose[:, 0], times, axis=0)),
+        held=jnp.asarray(scenario.steps),
+        condition=jnp.asarray(np.repeat(test.condition, times, axis=0)),
     )
-    first = np.asarray(traj.pose[:, 0]).reshape(len(test.object), times, 7)
-    off = np.abs(first - test.pose[:, :1]).max()
-    if not off <= _SAME:
-        raise RuntimeError(
-            "the first pose of a re-roll differs from the first pose of the held-out trajectory. The difference in one "
-            f"of the 7 numbers of the pose (position in metres and quaternion) is {off:.3g}, but at most {_SAME:g} is "
-            "allowed. This is an error in sts_jax: adapt _replayed in sts_jax/evaluation/rerolls.py to the random keys "
-            "that physics.simulate uses"
-        )
+    traj = physics.simulate(
+        key,
+        [bodies[i] for i in place],
+        sensor,
+        scenario,
+        times,
+        start=start,
+        engine=collection.engine,
+        progress=progress or False,
+    )
     pose, wrench = (np.asarray(leaf[:, -1]) for leaf in (traj.pose, traj.wrench))
     drawn = _drawn(collection, sensor, bodies, np.repeat(place, times), pose, wrench, test.visual.shape[2])
 
@@ -100,38 +95,6 @@ def ceiling(
         samples=Predicted(visual, tactile, pose, outcome),
         outcome_probability=probability,
     )
-
-
-def _replayed(
-    scenario: physics.Scenario, pose: np.ndarray, condition: np.ndarray, times: int, key: PRNGKeyArray
-) -> Any:
-    """A copy of the scenario with given first poses: every trajectory of body i begins at rest in `pose[i]`.
-
-    `simulate` draws first poses from keys and cannot be given any. The new scenario therefore finds the index of the
-    body: it compares the key that it receives with the keys of all bodies.
-    """
-
-    @jax.jit
-    @jax.vmap
-    def key_of(body: Array, draw: Array, attempt: Array) -> Array:
-        own = jax.random.fold_in(jax.random.fold_in(jax.random.fold_in(key, body), draw), attempt)
-        return jax.random.key_data(jax.random.split(own)[0])
-
-    index = np.indices((len(pose), times, ATTEMPTS)).reshape(3, -1)
-    known, body = np.asarray(key_of(*index)), index[0]
-
-    class Replayed(type(scenario)):  # type: ignore[misc]  # any of the scenarios
-        """A scenario whose first poses are given instead of drawn."""
-
-        def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-            """The start of the trajectory that has this random key. The pose is NaN if no trajectory has this key."""
-            del shape, pad
-            same = (jnp.asarray(known) == jax.random.key_data(key)).all(-1)
-            mine = jnp.asarray(body)[jnp.argmax(same)]
-            begin: Float[Array, "7"] = jnp.where(same.any(), jnp.asarray(pose)[mine], jnp.nan)
-            return Start(begin, jnp.asarray(self.steps), jnp.asarray(condition)[mine])
-
-    return Replayed(**vars(scenario))
 
 
 def _drawn(

@@ -75,6 +75,49 @@ def check_outcomes(scenario: Scenario, outcome: np.ndarray) -> None:
         )
 
 
+def check_start(start: Start, scenario: Scenario, count: int) -> Start:
+    """Check the starts that a caller passes to `simulate`, and return them as JAX arrays of n starts.
+
+    Args:
+        start: Starts of n trajectories: `pose` (n, 7), `condition` (n, c), and `held` and `carried` (n,) or one number.
+        scenario: Scenario, whose `quantities` define c.
+        count: Number n of trajectories.
+
+    Raises:
+        ValueError: A field has the wrong shape or a value out of range. The message names the field and the allowed
+            values.
+    """
+    pose, condition = np.asarray(start.pose, np.float32), np.asarray(start.condition, np.float32)
+    for name, values, width in (("pose", pose, 7), ("condition", condition, len(scenario.condition_scale))):
+        if values.shape != (count, width):
+            raise ValueError(
+                f"start.{name} has shape {values.shape}, but it must be {(count, width)}, with one row for each of the "
+                f"{count} trajectories (the number of bodies times `num`)"
+            )
+        if not np.isfinite(values).all():
+            raise ValueError(f"start.{name} has values that are not finite, but all must be finite")
+    if not np.allclose(np.linalg.norm(pose[:, 3:], axis=1), 1, atol=1e-3):
+        raise ValueError("start.pose has quaternions whose length is not 1: divide each quaternion by its length")
+    held, carried = np.asarray(start.held), np.asarray(start.carried, np.float32)
+    for name, values in (("held", held), ("carried", carried)):
+        if values.shape not in ((), (count,)):
+            raise ValueError(
+                f"start.{name} has shape {values.shape}, but it must be one number or have the shape {(count,)}"
+            )
+    if held.dtype.kind not in "iu" or held.min() < 0:
+        raise ValueError(f"start.held is {start.held}, but it must be whole numbers of time steps >= 0")
+    if not (carried.min() >= 0 and carried.max() <= 1):
+        raise ValueError(
+            f"start.carried has values from {carried.min()} to {carried.max()}, but each must be from 0 to 1"
+        )
+    return Start(
+        jnp.asarray(pose),
+        jnp.broadcast_to(jnp.asarray(held, jnp.int32), (count,)),
+        jnp.asarray(condition),
+        jnp.broadcast_to(jnp.asarray(carried), (count,)),
+    )
+
+
 def check_hidden(hidden: Hidden, count: int) -> Hidden:
     """Check the hidden properties that a caller passes to `simulate`, and return them as JAX arrays.
 

@@ -14,7 +14,14 @@ from tqdm import tqdm
 
 from sts_jax._keys import check_key
 from sts_jax.objects.body import Body
-from sts_jax.physics.arguments import check_arguments, check_condition, check_hidden, check_outcomes, listed
+from sts_jax.physics.arguments import (
+    check_arguments,
+    check_condition,
+    check_hidden,
+    check_outcomes,
+    check_start,
+    listed,
+)
 from sts_jax.physics.bodies import BodyError, hulls, shapes
 from sts_jax.physics.draws import draw
 from sts_jax.physics.engines import Engine, Rolled, Setup, gravity_at, in_c, in_mjx
@@ -30,6 +37,13 @@ from sts_jax.sensor import Sensor
 SUNK_LIMIT = 0.005
 ATTEMPTS = 5  # draws of one trajectory before an error is raised
 WORKERS = 2  # chunks that MJX simulates at the same time, because XLA runs each chunk on one CPU core
+
+
+class _Given(NamedTuple):
+    """The starts and hidden properties that replace the random ones, or None."""
+
+    starts: Start | None
+    hidden: Hidden | None
 
 
 class _Accepted(NamedTuple):
@@ -48,6 +62,7 @@ def simulate(
     scenario: Scenario,
     num: int = 1,
     *,
+    start: Start | None = None,
     hidden: Hidden | None = None,
     progress: bool | Callable[[int], object] = False,
     chunk: int = 32,
@@ -65,6 +80,9 @@ def simulate(
         sensor: Sensor whose `gel.size` is the size of the pad.
         scenario: `Freefall()`, `Inclined()`, `Perturbed()`, `Released()` or another `Scenario`.
         num: Number of trajectories of each body.
+        start: Starts that replace the random ones, ordered body by body. If all bodies together have n trajectories,
+            `pose` has the shape (n, 7) and `condition` has the shape (n, c). `held` and `carried` have the shape (n,)
+            or are one number for all trajectories. With `held=scenario.steps`, an object is released at frame 0.
         hidden: Hidden properties (friction, mass of the shell, and contents) that replace the random ones, ordered body
             by body. If all bodies together have n trajectories, the field `up` has the shape (n, 3), and the other
             fields have the shape (n,). A trajectory has the same start with and without `hidden` if it has the same
@@ -93,7 +111,10 @@ def simulate(
     check_arguments(bodies, sensor, scenario, num=num, chunk=chunk)
     if engine not in get_args(Engine):
         raise ValueError(f"engine is {engine!r}, but it must be {' or '.join(map(repr, get_args(Engine)))}")
-    given = None if hidden is None else check_hidden(hidden, len(bodies) * num)
+    given = _Given(
+        None if start is None else check_start(start, scenario, len(bodies) * num),
+        None if hidden is None else check_hidden(hidden, len(bodies) * num),
+    )
     frame = np.arange(scenario.frames)[:, None] / scenario.rate
     setup = Setup(
         bodies=bodies,
@@ -131,7 +152,7 @@ def _reported(progress: Any, count: int, engine: Engine) -> Iterator[Callable[[i
 def _accepted(
     key: PRNGKeyArray,
     setup: Setup,
-    given: Hidden | None,
+    given: _Given,
     chunk: int,
     engine: Engine,
     report: Callable[[int], object],
@@ -141,7 +162,7 @@ def _accepted(
     Args:
         key: Key of the whole set.
         setup: Properties of the trajectories that do not depend on the draws.
-        given: Hidden properties that replace the random ones, or None.
+        given: Starts and hidden properties that replace the random ones.
         chunk: Largest number of trajectories in one call of the engine.
         engine: Engine that simulates.
         report: Function that is called with the number of trajectories done so far.
@@ -158,7 +179,8 @@ def _accepted(
     while len(pending):
         starts, hidden = draw(key, setup.which, nth, attempt, shape, scenario=scenario, pad=setup.pad)
         check_condition(scenario, starts)
-        hidden = hidden if given is None else given
+        starts = starts if given.starts is None else given.starts
+        hidden = hidden if given.hidden is None else given.hidden
         chunks = _chunks(setup, pending, chunk, engine, workers)
         with concurrent.futures.ThreadPoolExecutor(workers) as pool:
             results = pool.map(prepare(setup, starts, hidden, chunk), chunks)
