@@ -151,7 +151,8 @@ def record(device: twin.Twin, folder: Path, count: int, note: str, bar: Bar) -> 
     with recording(folder, note) as session:
         if session.confirmed:
             raise ValueError(
-                f"{folder} has {session.confirmed} trajectories already: delete the folder, or choose another --workdir"
+                f"the number of trajectories in {folder} must be 0, got {session.confirmed}: delete the folder, or "
+                "choose another --workdir"
             )
         for done in range(count):
             bar(note, done, count)
@@ -174,7 +175,7 @@ def sessions(args: Args) -> hardware.Recordings:
     """Record the sessions `device` and `clean`, save the sensor file of `device`, and return the recordings of `clean`.
 
     Raises:
-        AssertionError: The logs of both twins show different poses.
+        AssertionError: The poses of the object differ between the two sessions.
     """
     lens = hardware.Lens.ideal(SIZE[1], SIZE[0])
     poses = []
@@ -202,7 +203,7 @@ def sessions(args: Args) -> hardware.Recordings:
 
 @dataclasses.dataclass(frozen=True)
 class Difference:
-    """A known difference from clean images."""
+    """A known difference from clean images: imperfections of the digital twin, and optionally its fisheye lens."""
 
     name: str  # title of the row in the table
     imperfections: twin.Imperfections = CLEAN
@@ -228,7 +229,7 @@ DIFFERENCES = (
 
 
 def changed(clean: gap.Streams, difference: Difference, resolution: tuple[int, int], seed: int) -> gap.Streams:
-    """Change clean images by a known difference.
+    """Add the imperfections and the lens of a `Difference` to clean images, and resize the images.
 
     Args:
         clean: Images of the clean session at the resolution of the twin's camera, uint8.
@@ -308,7 +309,7 @@ def table(clean: gap.Streams, resolution: tuple[int, int]) -> Iterator[str]:
 
 
 def main(args: Args) -> None:
-    """Record both sessions, then print the table.
+    """Record the sessions `device` and `clean`, then print the table of distances.
 
     Raises:
         ValueError: An option is out of range, or the work directory contains trajectories already.

@@ -1,4 +1,4 @@
-"""Influence of hidden properties on the outcome, and the information about them in touch and in images.
+"""Measure how much hidden properties change the outcome of a trajectory, and how well touch and images reveal them.
 
     python -m benchmarks.hidden                 # the jerked pad, about half an hour on two CPU cores
     python -m benchmarks.hidden outcomes truth  # two of the four parts, which are listed below
@@ -6,7 +6,9 @@
     python -m benchmarks.hidden outcomes truth --scenario inclined --soaked FOLDER  # starts from `benchmarks.soak`
 
 Hidden properties are those that a camera cannot see, such as the fill level of a bottle. A start is the initial state
-of a trajectory. The outcome is how the trajectory ends, such as by toppling. The parts are:
+of a trajectory. The outcome is how the trajectory ends, such as by toppling. The scenario `perturbed` is the jerked
+pad: a bottle stands on a pad that accelerates sideways for a short time. The scenario `inclined` is the slope: an
+object starts on a tilted pad or just above it. The parts are:
 
 - `outcomes`: the share of each outcome, and the share of the starts whose outcome changes if the hidden contents are
   replaced at random and all else stays the same. The random values are the fill level and, on the slope, also the side
@@ -19,7 +21,7 @@ of a trajectory. The outcome is how the trajectory ends, such as by toppling. Th
   network is trained on other objects.
 - `fill`: the AUC of a small network that separates objects that are more than half full from emptier objects. The
   inputs of the network are visual images of objects in the air, the same images with a tint on the fuller objects, or
-  tactile images. This part exists for the jerked pad only, because its scenario contains standing bottles.
+  tactile images. This part exists for the jerked pad only, because its objects are standing bottles.
 
 Cross-validation folds and bootstrap samples (for 95 % intervals) contain all starts of an object or none. The starts
 are simulated with the defaults of the scenario. All results are printed. The features of the classifiers are in
@@ -131,7 +133,8 @@ class Args:
 def outcomes(study: Study, starts: Starts) -> None:
     """Print the shares of outcomes, of unsettled starts, and of starts whose outcome changes with other contents.
 
-    A start is unsettled if its object is still on the pad and not at rest at the end of the trajectory.
+    A start is the initial state of a trajectory. It is unsettled if its object is still on the pad and not at rest at
+    the end of the trajectory. The other contents have a new random fill level and, on the slope, lie on a new side.
     """
     share = functools.partial(classifier.interval, classifier.mean, groups=starts.body)
     for outcome in study.scenario.outcomes:

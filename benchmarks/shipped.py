@@ -67,8 +67,8 @@ class Args:
 def collection(args: Args) -> dataset.Collection:
     """Description of a dataset with new objects for the model's experiment.
 
-    The training split contains a fifth of the objects, which are only used for the baselines and as a reference for
-    the metrics. The test split contains the other objects. The validation split is empty.
+    The training split contains a fifth of the objects, which only define the baselines and the frequencies of the
+    outcomes. The test split contains the other objects. The validation split is empty.
     """
     return dataclasses.replace(
         EXPERIMENTS[args.model].COLLECTION,

@@ -4,9 +4,9 @@
     python -m benchmarks.touch FOLDER   # another dataset of procedural objects of all classes
 
 A ridge regression of the logarithm of the mass on simple features of the image is fitted to the training objects. The
-features are the summed darkness of the imprint, its largest darkness and its number of pixels. The command uses the last
-images of objects that rest on the pad. It prints the accuracy on held-out objects, and the share of imprint pixels that
-are saturated, at 0 or 255. It writes no files.
+features are the summed darkness of the imprint, its largest darkness and its number of pixels. The command uses the
+last images of objects that rest on the pad. It prints the accuracy on held-out objects, and the share of imprint pixels
+that are saturated, at 0 or 255. It writes no files.
 """
 
 import dataclasses

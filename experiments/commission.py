@@ -35,7 +35,7 @@ V4L2_UNIT = 1e-4  # unit of the exposure of a Video4Linux device (s)
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Options of the command line: the devices, the output folder, and whether to calibrate the lens or assume one."""
+    """Options of the command line: devices, output folder, and whether to calibrate the lens or assume an ideal one."""
 
     camera: str | None = None  # path of the camera, such as /dev/v4l/by-id/..., or URL. None: list cameras and stop
     leds: str | None = None  # serial port of the LED controller, such as /dev/ttyACM0. None: list ports and stop

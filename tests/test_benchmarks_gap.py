@@ -45,7 +45,7 @@ def test_both_twins_record_the_same_poses_and_the_table_is_written(tmp_path, mon
         raw, wanted = getattr(device, stream).image, getattr(clean, stream).image.astype(int)
         rectified = hardware.rectified(lens, pinhole, raw, SIZE)
         assert np.abs(rectified - wanted).mean() < 10 < np.abs(raw - wanted).mean()
-    with pytest.raises(ValueError, match="has 10 trajectories already"):
+    with pytest.raises(ValueError, match="must be 0, got 10: delete the folder"):
         benchmark.main(args)
 
 

@@ -1,1 +1,1 @@
-"""Tools of the benchmarks: timing, new processes, reference images, trajectories, classifiers and emulated devices."""
+"""Tools of the benchmarks, such as timers, calls in new processes, reference images and emulated devices."""
