@@ -1,6 +1,6 @@
-"""An emulated camera: a local server of motion JPEG, with faults on request.
+"""An emulated camera: a local server that sends motion JPEG and can produce faults, such as repeated frames.
 
-Each frame shows its number as dark and light blocks, which can be read after the compression.
+Each frame shows its number as dark and light blocks, which remain readable after the JPEG compression.
 """
 
 import contextlib
@@ -50,7 +50,7 @@ class MotionJpeg:
     The following modes apply to each frame:
 
     - `live`: send numbered frames.
-    - `skip`: leave out the numbers in `skipped`.
+    - `skip`: leave out the frames whose numbers are in the attribute `skipped`.
     - `repeat`: send the last frame again.
     - `black`: send black frames.
     - `small`: send frames of half the width and height.
@@ -67,7 +67,8 @@ class MotionJpeg:
 
     Args:
         fps: Frames per second.
-        colour: BGR colour of all frames, except for a corner that alternates. None: frames show their numbers.
+        colour: BGR colour of all frames, except for a corner that alternates between two greys. None: the frames show
+            their numbers.
         size: Width and height of the frames (pixels).
     """
 
