@@ -151,7 +151,7 @@ def plausible(name: str, array: Float[Array, "..."]) -> Bool[Array, "*n"]:
 
 
 def check_values(name: str, array: np.ndarray) -> None:
-    """Check the numbers of an input.
+    """Check that all images or all poses of an input have finite numbers in the allowed range.
 
     Args:
         name: Name of the modality. All modalities but "pose" are images.

@@ -1,8 +1,10 @@
 """Allowed ranges of a dataclass's fields, declared in their metadata.
 
 `aspect: float = dataclasses.field(default=4 / 3, metadata=POSITIVE)` declares that every number of the field must be
-> 0. The metadata's keys are "above" (>), "at_least" (>=), "below" (<) and "at_most" (<=). `limits`
-compares the numbers of one field with them, and `check` the numbers of all fields.
+> 0. The metadata's keys are "above" (>), "at_least" (>=), "below" (<) and "at_most" (<=).
+
+`limits` compares the numbers of one field with the limits in its metadata. `check` raises an error if a field of a
+dataclass violates its limits.
 """
 
 import dataclasses
@@ -45,9 +47,10 @@ def limits(metadata: Mapping[str, Any], array: Any) -> list[tuple[Any, str]]:
 
 
 def check(config: Any) -> None:
-    """Check the fields of a dataclass that are a number or None. None is always allowed.
+    """Check each field of a dataclass against the limits in its metadata. A field without metadata is not checked.
 
-    The key "whole" of a field's metadata declares that the field has the type `int`.
+    The value of a checked field must be a number or None. None is always allowed. If the metadata has the entry
+    `"whole": True`, the number must be an integer.
 
     Raises:
         ValueError: A number is out of its field's range, not finite, or not whole.

@@ -159,8 +159,8 @@ def claim(path: Path, content: dict) -> None:
     found = list(_differences(there, content))
     if found:
         made = ", ".join(f"{field or 'content'} = {old!r}" for field, old, _ in found[:_SHOWN])
-        asked = ", ".join(repr(new) for _, _, new in found[:_SHOWN])
-        more = f" ({', '.join(field for field, _, _ in found[_SHOWN:])} differ too)" if found[_SHOWN:] else ""
+        asked = ", ".join(f"{field or 'content'} = {new!r}" for field, _, new in found[:_SHOWN])
+        more = f" (also different: {', '.join(field for field, _, _ in found[_SHOWN:])})" if found[_SHOWN:] else ""
         raise ValueError(
             f"{path} was made with {made}, but the current settings have {asked}{more}: "
             f"choose another folder, or delete {path.parent} to start again."

@@ -46,10 +46,10 @@ def test_soaked_reads_all_kept_blocks_in_order(tmp_path):
 
 def test_soaked_rejects_blocks_of_other_settings(tmp_path, monkeypatch):
     kept(tmp_path, "inclined", soak.BLOCK)
-    with pytest.raises(ValueError, match=r"inclined.json was made with block = 504, but the current settings have 104"):
+    with pytest.raises(ValueError, match=r"json was made with block = 504, but the current settings have block = 104"):
         soak.main(soak.Args(num=100, only="inclined"), tmp_path)
     monkeypatch.setattr(soak, "NUM", 4)
-    with pytest.raises(ValueError, match=r"inclined.json was made with num = 8, but the current settings have 4"):
+    with pytest.raises(ValueError, match=r"inclined.json was made with num = 8, but the current settings have num = 4"):
         soak.soaked(tmp_path, "inclined")
     other = dataclasses.replace(physics.Inclined(), tries=1)
     monkeypatch.setitem(soak.SCENARIOS, "inclined", other)

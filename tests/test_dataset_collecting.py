@@ -173,7 +173,7 @@ def test_a_scenario_without_quarter_turns_accepts_any_pad(tmp_path, monkeypatch)
 
 def test_another_collection_in_the_same_folder_is_refused(folder):
     other = dataclasses.replace(SMALL, scenario=sts.physics.Freefall(frames=12, spread=0.02))
-    with pytest.raises(ValueError, match=r"scenario\.spread = 0\.05, but the current settings have 0\.02"):
+    with pytest.raises(ValueError, match=r"spread = 0\.05, but the current settings have scenario\.spread = 0\.02"):
         dataset.collect(other, sts.Sensor(), folder)
 
 

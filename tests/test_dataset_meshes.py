@@ -136,5 +136,5 @@ def test_a_folder_without_usable_objects_and_a_wrong_number_are_refused(folder: 
         dataset.survey_meshes(folder, SCENARIO)
     meshes = dataset.Meshes(str(folder), ("a.stl",) * 5, ("a",) * 5, "")
     wrong = dataclasses.replace(collection(meshes), num_objects=4)
-    with pytest.raises(ValueError, match="num_objects=4, but `meshes` has 5"):
+    with pytest.raises(ValueError, match="num_objects=4, but the number of objects in `meshes` is 5"):
         dataset.collect(wrong, sts.Sensor(), tmp_path / "out")

@@ -164,7 +164,8 @@ def test_a_work_directory_of_another_configuration_names_the_fields_that_differ(
     with pytest.raises(
         ValueError,
         match=r"config\.json was made with collection\.num_objects = 16, state_training\.steps = 8, image_size = 64, "
-        r"but the current settings have 20, 9, 32 \(rerolls differ too\): choose another folder",
+        r"but the current settings have collection\.num_objects = 20, state_training\.steps = 9, image_size = 32 "
+        r"\(also different: rerolls\): choose another folder",
     ):
         stages.claim(other, tmp_path)
 

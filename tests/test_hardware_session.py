@@ -117,7 +117,7 @@ def test_reviewing_waits_for_the_end_of_collecting(tmp_path):
 
 def test_a_session_of_another_sensor_is_refused(tmp_path):
     Session.open(tmp_path, ORIGIN).close()
-    with pytest.raises(ValueError, match=r"leds = '0123', but the current settings have '0124'"):
+    with pytest.raises(ValueError, match=r"leds = '0123', but the current settings have leds = '0124'"):
         Session.open(tmp_path, dataclasses.replace(ORIGIN, leds="0124"))
     Session.open(tmp_path, ORIGIN).close()  # the lock was released
 

@@ -111,9 +111,9 @@ def test_other_settings_are_refused_and_equal_ones_are_not(tmp_path):
     before = path.stat().st_mtime_ns
     storage.claim(path, {"seed": 0, "gel": {"sizes": (1, 2)}})
     assert path.stat().st_mtime_ns == before
-    with pytest.raises(ValueError, match=r"config\.json was made with seed = 0, but the current settings have 1"):
+    with pytest.raises(ValueError, match=r"json was made with seed = 0, but the current settings have seed = 1"):
         storage.claim(path, {"seed": 1, "gel": {"sizes": (1, 2)}})
-    with pytest.raises(ValueError, match=r"gel\.sizes = \[1, 2\], but the current settings have \[1, 3\]"):
+    with pytest.raises(ValueError, match=r"gel\.sizes = \[1, 2\], but the current settings have gel\.sizes = \[1, 3\]"):
         storage.claim(path, {"seed": 0, "gel": {"sizes": (1, 3)}})
     path.write_text("[]")
     with pytest.raises(ValueError, match=r"content = \[\]"):

@@ -92,7 +92,7 @@ def test_a_model_is_loaded_from_its_folder(finished):
 def test_another_config_or_other_data_are_refused(finished):
     workdir, _ = finished
     with pytest.raises(
-        ValueError, match=r"config.json was made with training.steps = 12, .* but the current settings have 13"
+        ValueError, match=r"was made with training.steps = 12, .* but the current settings have training.steps = 13"
     ):
         training.train(training.TrainConfig(steps=13), SMALL, arrays(), workdir=workdir, preprocessing={"view": "pad"})
     with pytest.raises(ValueError, match=r"made with data.checksum"):

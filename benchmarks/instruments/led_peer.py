@@ -1,4 +1,4 @@
-"""An emulated LED controller on a pseudo-terminal, with faults on request."""
+"""An emulated LED controller on a pseudo-terminal, which can produce faults, such as lost answers."""
 
 import contextlib
 import os

@@ -65,8 +65,8 @@ class Collection:
             sensor: The sensor. Its pad must be square if `symmetries=True` and the scenario allows quarter turns.
 
         Raises:
-            ValueError: A field is out of range, a name in `categories` is unknown, or the pad must be square and
-                is not. The message names the field.
+            ValueError: A field is out of range, a name in `categories` is unknown, or the pad of the sensor is not
+                square although the collection needs a square pad. The message names the field.
         """
         sides = [float(side) for side in sensor.gel.size]
         quarter_turns = any(symmetry % 2 for symmetry in symmetries_of(self))
@@ -82,7 +82,8 @@ class Collection:
         if self.meshes is not None and self.num_objects != len(self.meshes.names):
             count = len(self.meshes.names)
             raise ValueError(
-                f"num_objects={self.num_objects}, but `meshes` has {count} objects: set num_objects={count}"
+                f"num_objects={self.num_objects}, but the number of objects in `meshes` is {count}: "
+                f"set num_objects={count}"
             )
         if self.meshes is None and not self.categories:
             raise ValueError("categories is empty, but it must name at least one class, such as 'bottle'")

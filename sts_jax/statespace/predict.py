@@ -1,4 +1,4 @@
-"""Predictions of a state-space model: samples of the final pose and of both images, from any subset of the inputs."""
+"""Samples of final poses and of visual and tactile images from a state-space model, given any subset of the inputs."""
 
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ from sts_jax.statespace.objective import reduced
 class Samples(NamedTuple):
     """Samples of the last frame: k final poses for each of n items, and images of some of these poses.
 
-    Of the k poses of an item, only the poses with index 0 to `drawn` - 1 have images. `drawn` is an argument of
+    Each item has k poses, but only the poses with index 0 to `drawn` - 1 have images. `drawn` is an argument of
     `sample`.
     """
 
@@ -63,8 +63,9 @@ def sample(
             is drawn for each of these poses.
 
     Returns:
-        The posterior of the state code and the appearance code of the first frame, the probabilities of the outcomes,
-        the sampled final poses and images, and the mean images of each item over the `drawn` samples.
+        The posterior of the first frame, the probabilities of the outcomes (such as resting or falling off), the
+        sampled final poses and images, and the mean images of each item over the `drawn` samples. The posterior is a
+        Gaussian over the state code (pose, shape and mass) and the appearance code (all other visible properties).
 
     Raises:
         ValueError: `drawn` is out of range.
@@ -90,8 +91,9 @@ def sample(
 class Drawn(NamedTuple):
     """Samples without complete images: k final poses for each of n items, and layers for some of these poses.
 
-    Of the k poses of an item, only the poses with index 0 to `drawn` - 1 have layers. `drawn` is an argument of `draw`.
-    `compose` makes complete images from the layers, see `layers.Layers`.
+    Each item has k poses, but only the poses with index 0 to `drawn` - 1 have layers. `drawn` is an argument of `draw`.
+    The layers are the outlines and colours of the objects, and the changes that the objects cause in the tactile
+    images. `compose` combines them with the images of the empty sensor, and returns complete images.
     """
 
     belief: Gaussian  # posterior of the state code and the appearance code of the first frame, (n, code + look)
@@ -116,8 +118,9 @@ def draw(
 ) -> Drawn:
     """Sample final poses, and render layers for the first `drawn` poses of each item.
 
-    `compose` makes complete images from the layers, see `layers.Layers`. The arguments after `model` are the same as
-    in `sample`.
+    The layers are the outlines and colours of the objects, and the changes that the objects cause in the tactile
+    images. `compose` combines them with the images of the empty sensor, and returns complete images. The arguments
+    after `model` are the same as in `sample`.
     """
     belief, final = calibration.predict(model, inputs, present, empty, condition, correction)
     end, appearance, outline = jax.random.split(key, 3)

@@ -1,4 +1,4 @@
-"""Tactile stream: equilibrium of the gel, shape of the skin, lights, shadows and reflectance."""
+"""Images of the lit skin (tactile stream): equilibrium of the gel, shape of the skin, lights, shadows, reflectance."""
 
 from sts_jax.tactile.gel import Equilibrium, Gel, cell_area, cell_centres, indent, settle
 from sts_jax.tactile.normals import surface_normals

@@ -62,7 +62,7 @@ def smallest_eigenvector(
     eigenvector. Then `adj(A - lambda I) = (lambda_1 - lambda) (lambda_2 - lambda) v v^T`, and v is the largest column
     of this matrix, divided by its length.
 
-    The derivative exists if lambda differs from lambda_1 and from lambda_2, also if lambda_1 equals lambda_2. If lambda
+    The derivative exists if lambda differs from lambda_1 and from lambda_2, even if lambda_1 equals lambda_2. If lambda
     equals lambda_1 or lambda_2, the result is an arbitrary unit vector with zero gradient.
 
     Args:
