@@ -350,7 +350,8 @@ class Predictor:
         if width != 0 and shape != (*lead, width):
             given = "condition is missing" if shape is None else f"condition has shape {shape}"
             raise ValueError(
-                f"{given}, but {self.name} needs shape {(*lead, width)}: give a condition of this shape, in SI units."
+                f"{given}, but {self.name} needs a condition of shape {(*lead, width)}: give an array of this "
+                "shape, in SI units."
             )
         if array is None:
             return None, None

@@ -140,7 +140,8 @@ def predict_samples(
         preprocessing: Preprocessing with which the model was trained.
         empty: Images "visual" and "tactile" of the untouched sensor in [0, 1].
         inputs: All inputs of the model by the name of the modality: images (*n, height, width, 3) and poses (*n, 7).
-            For inputs that are not given, call `completed` first, which adds placeholders.
+            For inputs that are not given, call `completed` first, which adds placeholders. The entry "state", the true
+            state (*n, code) from `statespace.encode`, is optional.
         present: Masks (*n,) by the name of the modality. False means that the input of this modality is ignored for
             this item of the batch.
         condition: Known parameters of each trajectory in SI units, (*n, c). None for a model that was trained without
@@ -148,8 +149,8 @@ def predict_samples(
         key: Random key for the samples. None stands for `jax.random.key(0)`, so that every call gives the same result.
         num_samples: Number of samples to return in `Prediction.samples`.
         shape: Leading axes *n of the inputs and the prediction.
-        calibration: Correction of the probability density of the final pose, from `statespace.fit_calibration`. None
-            for no correction.
+        calibration: Calibration from `statespace.fit_calibration`. It corrects the probability density of the final
+            pose, and sets the contrast of the sampled images. None for no correction and the default contrast.
 
     Returns:
         The prediction for each item.

@@ -1,4 +1,4 @@
-"""`Sensor`: all constants of one sensor, with their checks and their file."""
+"""`Sensor`: all constants of one sensor, with methods that check them, save them and load them."""
 
 import dataclasses
 import functools
@@ -269,7 +269,7 @@ def _field_conditions(
         if isinstance(default, jax.Array) and not isinstance(value, jax.Array | np.ndarray):
             raise ValueError(f"field {name} is {value!r}, but it must be a NumPy or JAX array.")
         if static and not all(isinstance(number, int | np.integer) for number in numbers):
-            raise ValueError(f"field {name} is {value!r}, but its numbers must have the type int or np.integer.")
+            raise ValueError(f"field {name} is {value!r}, but only integers (int or np.integer) are allowed.")
         yield from _value_conditions(default, value, name, metadata)
         return
     if type(value) is not type(default):

@@ -199,8 +199,8 @@ def test_a_condition_is_given_in_si_units(tmp_path):
     samples = predictor(visual=given["visual"], condition=condition, key=jax.random.key(0), num_samples=2).samples
     assert samples.visual.shape == (2, 2, SIDE, SIDE, 3)
     for wrong, message in (
-        (None, r"condition is missing, but .* needs shape \(2, 3\)"),
-        (condition[0], r"condition has shape \(3,\), but .* needs shape \(2, 3\)"),
+        (None, r"condition is missing, but .* needs a condition of shape \(2, 3\)"),
+        (condition[0], r"condition has shape \(3,\), but .* needs a condition of shape \(2, 3\)"),
         (condition * np.nan, "condition has NaN"),
         (condition * 1e3, "SI units"),
     ):

@@ -1,4 +1,7 @@
-"""The second program of `sense`: both streams and depth of an object in balance, at one resolution."""
+"""The second compiled program of `sense`: it draws the visual, tactile and depth images of an object in balance.
+
+The program is compiled again for each new resolution.
+"""
 
 import functools
 import operator
@@ -20,7 +23,7 @@ from sts_jax.sensor import Sensor
 
 
 class Images(NamedTuple):
-    """Images of one frame."""
+    """Visual, tactile and depth image of one frame, the mask of the object, and the part of the gel in the images."""
 
     visual: Float[Array, "h w 3"]  # view through the skin, sRGB in [0, 1]
     tactile: Float[Array, "h w 3"]  # image of the lit skin in [0, 1]

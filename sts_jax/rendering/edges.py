@@ -1,4 +1,4 @@
-"""Derivative of an imprint with respect to the pose of the object, which moves the edges of the imprint."""
+"""Derivative of an imprint with respect to the object's pose, including the motion of the imprint's edges."""
 
 import functools
 import operator
@@ -22,8 +22,8 @@ def with_moving_edges(
     """Return the imprint unchanged, but with a derivative that includes the motion of its edges.
 
     The depth at a pixel is interpolated on the face that is visible there. The derivative of this depth ignores edges
-    that move across pixels. The imprint of a flat object with upright walls changes only at such edges. The derivative
-    here is
+    that move across pixels. If a flat object with upright walls moves sideways, its imprint changes only at such edges.
+    The derivative here is
 
         d imprint = rate - v . grad imprint
 

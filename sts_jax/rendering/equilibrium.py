@@ -1,4 +1,7 @@
-"""The first program of `sense`: an object in balance on the gel, independent of the images' resolution."""
+"""The first compiled program of `sense`: it lets an object sink and tilt until the gel and the object are in balance.
+
+The program does not depend on the resolution of the images.
+"""
 
 from typing import NamedTuple
 
@@ -95,7 +98,7 @@ def underside(
         faces: Vertex indices of the object's faces.
         two_sided: True if faces are also visible from behind.
         points: Vertices in the sensor frame (m).
-        present: False if there is no object.
+        present: If False, the object is ignored, and both height maps are `inf` everywhere.
 
     Returns:
         Two height maps (m). The first map contains only those faces of the object that are low enough to press on the

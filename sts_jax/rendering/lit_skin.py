@@ -1,4 +1,4 @@
-"""Tactile stream: image of the skin with an imprint, lit from inside."""
+"""Tactile image: the skin of the gel, deformed by an imprint, under the lights inside the sensor."""
 
 import jax
 import jax.numpy as jnp
