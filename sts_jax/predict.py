@@ -195,7 +195,7 @@ class Predictor:
         leads = {name: array.shape[: -1 if name == "pose" else -3] for name, array in arrays.items()}
         lead = next(iter(leads.values()))
         if len(set(leads.values())) > 1:
-            raise ValueError(f"the leading axes differ: {leads}. Pass the same number of items of each modality.")
+            raise ValueError(f"the leading axes differ: {leads}. Pass arrays with the same leading axes.")
         masks = _arguments.checked_masks(present, arrays, lead)
         valid: Array | None = None  # mask of the valid items, (*n,), or None if no value is traced
         for name, array in arrays.items():
@@ -289,7 +289,7 @@ class Predictor:
 
     @property
     def empty(self) -> dict[str, np.ndarray]:
-        """Visual and tactile image of the untouched sensor, by name, float32 (height, width, 3) in [0, 1]."""
+        """Images of the untouched sensor under "visual" and "tactile": float32 (height, width, 3) in [0, 1]."""
         return {name: np.asarray(image) for name, image in self._empty.items()}
 
     def _checked_name(self, name: str, value: Any) -> np.ndarray | Array:

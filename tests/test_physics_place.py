@@ -113,8 +113,8 @@ def test_more_shell_or_contents_weigh_more(bodies):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"face": 99}, r"`face` is 99, .* no such face: the body rests on faces 0 \(the most likely\) to \d+"),
-        ({"face": -1}, r"`face` is -1, but the body has no such face: the body rests on faces 0"),
+        ({"face": 99}, r"`face` is 99, .* no such face: the body can rest on faces 0 \(the most likely\) to \d+"),
+        ({"face": -1}, r"`face` is -1, but the body has no such face: the body can rest on faces 0"),
         ({"face": "sideways"}, r"`face` is 'sideways', but it must be the index of a face or 'upright'"),
         ({"position": (0.2, 0.0)}, r"position is \(0.2, 0.0\) m, .* beyond the pad"),
         ({"position": (0.0, float("nan"))}, "position is .* 2 finite numbers"),

@@ -13,7 +13,7 @@ Progress = Callable[[int, int], None]  # called with the number of trajectories 
 
 
 class SensorView(NamedTuple):
-    """Rectified images of both streams at one time, for the arguments `visual` and `tactile` of a `Predictor`."""
+    """A rectified visual image and a rectified tactile image, for `visual` and `tactile` of a `Predictor`."""
 
     visual: Float[np.ndarray, "height width 3"]  # visual image, RGB, float32 in [0, 1]
     tactile: Float[np.ndarray, "height width 3"]  # tactile image, RGB, float32 in [0, 1]
@@ -49,8 +49,8 @@ def sensor_view(
         The rectified images. Each pixel is the mean of the raw image over the pixel's area.
 
     Raises:
-        ValueError: An image is not uint8, or its size is not `lens.height` x `lens.width`. Or `resolution` is out of
-            range. Or the view contains rays at larger angles than `Lens.largest_angle`.
+        ValueError: An image is not uint8, or its size is not `lens.height` x `lens.width`. Or `resolution` or `pinhole`
+            is out of range. Or the view contains rays at larger angles than `Lens.largest_angle`.
     """
     images = (rectified(lens, pinhole, image, resolution) for image in (visual, tactile))
     return SensorView(*(image.astype(np.float32) / 255 for image in images))
@@ -114,6 +114,8 @@ def recorded_images(
 
     Raises:
         ValueError: There is no confirmed trajectory, or the size of the images is not `lens.height` x `lens.width`.
+            Or `resolution` or `pinhole` is out of range. Or the view contains rays at larger angles than
+            `Lens.largest_angle`.
         DamagedFileError: A file is missing or damaged.
     """
     width, height = recordings.session["width"], recordings.session["height"]

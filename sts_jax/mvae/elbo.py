@@ -186,9 +186,8 @@ def infer(
     unknown = sorted({*inputs, *(present or {})} - set(model.config.names))
     if unknown or not inputs:
         raise ValueError(
-            f"`inputs` has the names {list(inputs)} and `present` has the names {list(present or {})}, but both may "
-            f"only have names of the model's modalities {list(model.config.names)}: use only the names "
-            "of these modalities, and give at least one input"
+            f"`inputs` has the names {list(inputs)} and `present` has the names {list(present or {})}: give at "
+            f"least one input, and use only the names of the model's modalities {list(model.config.names)}"
         )
     absent = tuple(name for name in model.config.names if name not in inputs)
     batch = len(next(iter(inputs.values())))

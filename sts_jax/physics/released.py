@@ -41,8 +41,8 @@ class Released(Scenario):
     balance angle, the contents therefore decide the outcome.
 
     In frame 0 the object is at rest. The pad carries a random share of the weight (`carried`). The hand carries the
-    rest of the weight and balances all moments. The wrench in frame 0 follows from the held pose and this share
-    (`held.held_wrench`). It does not depend on the motion after the release.
+    rest of the weight and balances all moments. The wrench of the pad on the object in frame 0 is computed from the
+    held pose and this share (`held.held_wrench`). It does not depend on the motion after the release.
 
     Each trajectory draws its values uniformly from the ranges in the fields. Source: the See-Through-your-Skin paper,
     section "Real-World Dataset", where the object is a small camera.

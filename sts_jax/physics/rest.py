@@ -141,7 +141,7 @@ def place(
             most likely one. "upright" is the face on which the body rests with its +z axis up.
         yaw: Rotation about the sensor's z axis (rad). At 0, the +z axis of a lying body points to the top of the image.
             If the body stands upright or upside down, its -y axis points there instead.
-        position: x and y of the centre of the body's extent (m).
+        position: x and y of the centre of the body's bounding box (m).
         fill: Share of the interior's volume that is filled, 0 to 1.
         shell_scale: Factor on the shell's mass, > 0.
         up: Direction that was up when the contents settled, as a unit vector in the mesh frame. Placing the body
@@ -199,7 +199,7 @@ def _index(faces: StableFaces, face: int | str) -> int:
             "face, at least 0.5 mm inside the face's outline. Give `sense` a pose of your own."
         )
     numbers = f"faces 0 (the most likely) to {count - 1}" if count > 1 else "face 0 only"
-    numbered = f"the body rests on {numbers}"
+    numbered = f"the body can rest on {numbers}"
     if isinstance(face, str):
         if face != "upright":
             raise ValueError(f"`face` is {face!r}, but it must be the index of a face or 'upright': {numbered}")

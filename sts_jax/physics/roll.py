@@ -111,9 +111,11 @@ def _depth(points: Float[Array, "3 h"], model: mjx.Model) -> Float[Array, ""]:
 def step(model: mjx.Model, data: mjx.Data, hull: Hull, state: State, gravity: Float[Array, "3"]) -> State:
     """Advance a state by one time step.
 
-    The new state contains the wrench of the pad on the object, summed over all contacts with the pad. The moment is
-    about the sensor's origin. The scene also has a wall that stops the object. Contacts with the wall are not part of
-    the wrench.
+    The step adds the wrench of the pad on the object to the field `impulse` of the state. If the pad does not push the
+    object, `impulse` is set to 0 instead. The wrench is summed over all contacts with the pad, and its moment is about
+    the sensor's origin. If the scene has a stop wall, contacts with the wall are not part of the wrench.
+
+    An object that is held, or that has left the pad, does not move, and its `impulse` is 0.
 
     Args:
         model: Model of the scene in MJX. Its gravity is replaced.

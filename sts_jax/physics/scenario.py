@@ -242,7 +242,12 @@ class Scenario(abc.ABC):
         return names[number]
 
     def described(self, condition: Float[Array | np.ndarray, "c"]) -> str:
-        """Describe a condition (c,) in words, such as "acceleration (3.1, -7.2) m/s², duration 0.085 s"."""
+        """Describe a condition in words, such as "acceleration (3.1, -7.2) m/s², duration 0.085 s".
+
+        Args:
+            condition: Known quantities of a trajectory in SI units, such as an acceleration, (c,). The attribute
+                `quantities` describes them.
+        """
         words, rest = [], np.asarray(condition).tolist()
         for quantity in self.quantities:
             own, rest = (rest[:2], rest[2:]) if quantity.vector else (rest[:1], rest[1:])
@@ -251,7 +256,11 @@ class Scenario(abc.ABC):
         return ", ".join(words)
 
     def hidden(self, key: PRNGKeyArray) -> Hidden:
-        """Draw the hidden properties of one trajectory. `key` is for this draw alone."""
+        """Draw the hidden properties (friction, mass of the shell, and contents) of one trajectory.
+
+        Args:
+            key: Key for this draw alone.
+        """
         fill, shell, friction, high, around = jax.random.split(key, 5)
 
         def draw(key: PRNGKeyArray, limits: tuple[float, float]) -> Float[Array, ""]:

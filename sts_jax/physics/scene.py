@@ -1,8 +1,9 @@
 """The scene of all scenarios as MuJoCo and MJX models: a fixed pad and one free object above it.
 
-The pad is a box whose top face lies in z = 0 of the sensor frame. On the slope, a stop wall stands just beyond the
-gel's lower edge, at the largest y. The wall reaches down to the bottom of the pad. The body frame of the object is the
-mesh frame, so `qpos` is the object's pose. The centre of mass is a separate value of the model.
+The pad is a box whose top face lies in the plane z = 0 of the sensor frame. If `Scenario.wall` is > 0, as in
+`Inclined`, a stop wall stands just beyond the gel, on the side of +y. The wall reaches down to the bottom of the pad.
+The body frame of the object is the mesh frame, so `qpos` is the object's pose. The model stores the centre of mass
+separately (`body_ipos`).
 
 MJX steps one template model for all objects (`step`, `template`). Objects differ only in a few arrays and in their
 contacts. `compile_scene` compiles the same scene with the object's mesh for C MuJoCo.

@@ -1,4 +1,4 @@
-"""`simulate`: random starts and hidden properties, and their trajectories, computed in chunks by MJX or C MuJoCo."""
+"""`simulate`: trajectories with random starts and hidden properties, computed in chunks by C MuJoCo or MJX."""
 
 import concurrent.futures
 import contextlib
@@ -91,8 +91,8 @@ def simulate(
             chunk with the number of trajectories done so far. With MJX, tens of seconds of compilation precede the
             first chunk.
         chunk: Largest number of trajectories that are simulated at once. With MJX, each new value causes a compilation
-            and changes the results by rounding errors. Larger values suit a GPU. With C MuJoCo, `chunk` is the largest
-            number for each thread, and the results do not depend on `chunk`.
+            and changes the results by rounding errors. Larger values suit a GPU. With C MuJoCo, each thread receives
+            at most `chunk` trajectories at a time, and the results do not depend on `chunk`.
         engine: "mujoco" is C MuJoCo on all CPU cores. "mjx" compiles the simulation for JAX's default device. On a CPU,
             MJX is several times as slow as C MuJoCo. On a GPU, MJX is faster only with a large `chunk`, such as 4,096
             trajectories of one object. Both engines draw the same starts and hidden properties from a key.

@@ -1,4 +1,4 @@
-"""The distortion of a fisheye lens, which `Blender` applies to the rendered images."""
+"""`lens_warp`: computes the distortion of a fisheye lens, which a `Twin` applies to its rendered images."""
 
 import dataclasses
 import math
@@ -29,7 +29,7 @@ def lens_warp(lens: Lens, pinhole: Pinhole, resolution: tuple[int, int], *, samp
         Mapping, for the argument `warp` of `Twin` or `Blender`.
 
     Raises:
-        ValueError: `samples` is less than 1.
+        ValueError: `samples` is less than 1, or `resolution` or `pinhole` is out of range.
     """
     if samples is None:
         samples = min(max(1, math.ceil(_largest_step(distortion(lens, pinhole, resolution), resolution))), MOST_SAMPLES)

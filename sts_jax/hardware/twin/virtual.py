@@ -32,10 +32,11 @@ class VirtualSensor:
     ```
 
     Each image is exposed under one constant light, as with `STS`. To ensure this, `read` waits for the settling time
-    after each switch of the lights. This time begins when the LED controller confirms the switch, and it ends when all
-    arriving frames show only the new light. `read` then takes the next frame, and asks the controller if the lights
-    have changed since the switch. Frames that arrive during the settling time are not rendered. Faults of the camera
-    are not detected.
+    after each switch of the lights. The settling time begins when the LED controller confirms the switch. Frames that
+    arrive after the settling time show only the new light. `read` takes one of these frames, and asks the
+    controller if the lights have changed since the switch. If they have changed, `read` switches the lights again and
+    takes another frame. Frames that arrive during the settling time are not rendered. Faults of the camera are not
+    detected.
     """
 
     def __init__(
@@ -113,8 +114,8 @@ class VirtualSensor:
             self._lit = None
         raise LightError(
             f"the lights changed in each of {_ATTEMPTS} attempts to take a {stream} image. The settling time is "
-            f"{settled_s:g} s, but the LED controller turns its lights off after 1 s without a request: give a "
-            "settling time below 1 s (argument settling)"
+            f"{settled_s:g} s, but the LED controller turns its lights off after 1 s without a request: give "
+            "`VirtualSensor` settling times below 1 s (argument `settling`)"
         )
 
     def _set(self, stream: Stream) -> Lit:
