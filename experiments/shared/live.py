@@ -163,7 +163,7 @@ class Live:
         self._thread.start()
 
     def offer(self, visual: hardware.Shot, tactile: hardware.Shot) -> None:
-        """Pass images to the thread for its next prediction, in place of earlier images that it has not used yet.
+        """Pass new images to the prediction thread. They replace earlier images that the thread has not used yet.
 
         Args:
             visual: Newest visual image.

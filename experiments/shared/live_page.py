@@ -12,7 +12,7 @@ _STREAMS = ("visual", "tactile", "predicted_visual", "predicted_tactile")
 
 
 class LivePage(Site):
-    """The page of `experiments.live`."""
+    """The browser page of `experiments.live`, which shows the live images, the predicted images and other values."""
 
     def __init__(self, host: str, port: int, *, title: str):
         """Start the server of the page.
@@ -30,13 +30,13 @@ class LivePage(Site):
         super().__init__(host, port, _PAGE, _STREAMS)
 
     def show(self, seen: Seen) -> None:
-        """Show new images and facts in all open pages."""
+        """Update the images and the other values, such as the latency, in all open pages."""
         with self._changed:
             self._seen, self._number = seen, self._number + 1
             self._changed.notify_all()
 
     def facts(self) -> dict[str, Any]:
-        """The current values of the display without its images, for JSON."""
+        """The values that the page shows besides the images, such as the latency, as a dict for JSON."""
         with self._changed:
             seen, ended = self._seen, self._ended
         if seen is None:

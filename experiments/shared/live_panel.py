@@ -26,8 +26,9 @@ _ROWS = 6  # largest number of panels of a picture, which are chosen evenly from
 
 
 def panel(seen: Seen) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw the display at one time: the live and the predicted images, the outcome probabilities, rate and latency.
+    """Draw the live display at one time as an RGB image, which is called a panel.
 
+    A panel shows the live images, the predicted images, the outcome probabilities, the prediction rate and the latency.
     All panels have the same size.
     """
     found = seen.predicted
@@ -63,7 +64,11 @@ def lines(seen: Seen) -> list[str]:
 
 
 class PanelFile:
-    """A file of panels: a video with 10 panels per second, or a picture with up to six panels below each other."""
+    """A video or a picture of the live display over time, which consists of panels.
+
+    A panel is an image of the display at one time (function `panel`). A video has 10 panels per second. A picture has
+    up to six panels, one below the other.
+    """
 
     def __init__(self, path: Path):
         """Check the path.
@@ -89,7 +94,9 @@ class PanelFile:
         self._next_s = -float("inf")  # time at which the next panel is due (s)
 
     def add(self, seen: Seen) -> None:
-        """Draw a panel and add the panel to the file, if a panel is due and the model has made predictions.
+        """Draw a panel and add it to the video or picture, if a panel is due and `seen.rate` is above zero.
+
+        A panel is due every 0.1 s for a video, and every second for a picture. `close` writes the picture.
 
         Raises:
             OSError: The video cannot be written.

@@ -1,4 +1,4 @@
-"""Starts a digital twin in another process, writes the twin's sensor file, and holds and releases its object."""
+"""Runs a digital twin of the sensor in another process, and repeatedly holds and releases the simulated object."""
 
 import contextlib
 import json
@@ -20,7 +20,7 @@ _ANSWER_S = 120.0  # longest wait for an answer of the twin, which may render im
 
 
 class OwnTwin:
-    """A twin that runs in another process. `own_twin` starts and stops it."""
+    """A digital twin of the sensor that runs in another process. The function `own_twin` starts and stops the twin."""
 
     def __init__(self, folder: Path, leds: Path, url: str):
         """Use `own_twin` instead.
@@ -37,7 +37,7 @@ class OwnTwin:
         self._thread = threading.Thread(target=self._operate, name="hand", daemon=True)
 
     def start(self) -> None:
-        """Start a thread that holds and releases the object repeatedly."""
+        """Start a thread that holds and releases the simulated object repeatedly."""
         self._thread.start()
 
     def close(self) -> None:
@@ -59,7 +59,7 @@ class OwnTwin:
                     return
 
     def phase(self, command: str) -> dict[str, object]:
-        """Send the twin a command (`hold`, `release` or `clear`), and return the state with which it answers."""
+        """Send a command (`hold`, `release` or `clear`) to the twin, and return the twin's state after the command."""
         request = urllib.request.Request(f"{self._url}/{command}", method="POST")
         with urllib.request.urlopen(request, timeout=_ANSWER_S) as answer:
             return json.load(answer)
@@ -67,10 +67,12 @@ class OwnTwin:
 
 @contextlib.contextmanager
 def own_twin(folder: Path, *, seed: int = 0) -> Iterator[OwnTwin]:
-    """Start a twin, write the twin's sensor file with `experiments.commission`, and stop the twin afterwards.
+    """Start a digital twin of the sensor in another process, and stop the twin at the end of the `with` block.
+
+    Before the block, `experiments.commission` writes the sensor file of the twin.
 
     Args:
-        folder: Empty folder, which receives the sensor file and the link to the serial port.
+        folder: Empty folder, which receives the sensor file and a link to the twin's virtual serial port.
         seed: Seed of the object and its trajectories.
 
     Raises:

@@ -12,7 +12,10 @@ _STREAMS = ("visual", "tactile")
 
 
 class Page(Site):
-    """A `hardware.Person` that shows each view in a browser, and returns the actions of the person at the browser."""
+    """A browser page that implements `hardware.Person`.
+
+    The page shows each `hardware.View` that it receives, and returns the actions of the person who uses the browser.
+    """
 
     def __init__(self, host: str, port: int, *, count: int | None = None):
         """Start the server of the page.
@@ -31,7 +34,7 @@ class Page(Site):
         super().__init__(host, port, _PAGE, _STREAMS)
 
     def show(self, view: View) -> None:
-        """Show a view in all open pages."""
+        """Update all open pages with the images and the instruction of a view."""
         with self._changed:
             self._view, self._number = view, self._number + 1
             self._changed.notify_all()
@@ -65,7 +68,7 @@ class Page(Site):
             return True
 
     def facts(self) -> dict[str, Any]:
-        """The current view without its images, for JSON."""
+        """The values that the page shows besides the images, such as the instruction, as a dict for JSON."""
         with self._changed:
             view, ended = self._view, self._ended
         if view is None:
@@ -97,7 +100,7 @@ class Page(Site):
         return None if pair is None else getattr(pair, stream).image
 
     def still(self, path: str) -> Image | None:
-        """The image of the current trajectory at a path such as `end/initial/visual.jpg`, or None without an image."""
+        """The current trajectory's image at a URL path such as `end/initial/visual.jpg`, or None if there is none."""
         head, _, rest = path.partition("/")
         end, _, name = rest.partition("/")
         stream = name.removesuffix(".jpg")

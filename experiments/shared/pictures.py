@@ -1,4 +1,4 @@
-"""Draws and describes trajectories."""
+"""Draws simulated trajectories as pictures, and describes them in words."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,10 +11,10 @@ from sts_jax import dataset, evaluation
 
 
 def draw_strip(path: Path, collection: dataset.Collection, sensor: sts.Sensor, data: dataset.Dataset) -> None:
-    """Draw a fully rendered trajectory as a strip of pictures.
+    """Draw a trajectory of a dataset as a strip of pictures.
 
-    The function draws the trajectory whose outcome comes earliest in the scenario's list of outcomes. If several
-    trajectories have this outcome, the first of them is drawn.
+    Only fully rendered trajectories are considered. They have images of every frame. The function draws the one whose
+    outcome comes earliest in the scenario's list of outcomes. If several of them have this outcome, it draws the first.
 
     Args:
         path: Path of the picture.
@@ -41,13 +41,14 @@ def draw_strip(path: Path, collection: dataset.Collection, sensor: sts.Sensor, d
 
 
 def views(body: sts.objects.Body, pose: np.ndarray, gravity: np.ndarray, sensor: sts.Sensor, wall: float) -> np.ndarray:
-    """Render a trajectory from outside, with the final direction of gravity pointing down.
+    """Render the object and the pad obliquely from above, in one picture for each frame of a trajectory.
 
-    An object that has fallen off the pad is drawn only while its pose changes.
+    The final direction of gravity points down in the pictures. An object that has fallen off the pad is drawn only
+    while its pose changes.
 
     Args:
         body: The object.
-        pose: Poses in the sensor frame, shape (frames, 7).
+        pose: Poses of the object in the sensor frame, position (m) and quaternion (w, x, y, z), shape (frames, 7).
         gravity: Gravity in the sensor frame (m/s^2), shape (frames, 3).
         sensor: Sensor, whose pad is drawn.
         wall: Height of the stop wall (m), 0 for none.
@@ -64,7 +65,7 @@ def views(body: sts.objects.Body, pose: np.ndarray, gravity: np.ndarray, sensor:
 def describe(
     scenario: sts.physics.Scenario, name: str, trajectory: Mapping[str, np.ndarray], hidden: Mapping[str, np.ndarray]
 ) -> str:
-    """Describe a trajectory in words: class, outcome, hidden properties and condition.
+    """Describe a trajectory in words: class, outcome, hidden properties and known quantities of the scenario.
 
     Args:
         scenario: Scenario of the trajectory.

@@ -21,7 +21,7 @@ LEAST = 5  # smallest number of trajectories, so that one of them can be held ou
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """How the models of Table 2 are trained and evaluated."""
+    """Options to train and evaluate the models of the paper's Table 2 on recorded trajectories."""
 
     training: TrainConfig  # options of the training
     # number of trajectories that the digital twin collects if the work directory has none of a device
@@ -82,16 +82,16 @@ def read(config: Config, workdir: Path) -> Recorded:
 
     Raises:
         FileNotFoundError: There is no session, or no sensor file.
-        ValueError: There are too few trajectories, or the sensor file names no background images (images of the empty
-            pad), or the sensor file does not fit the images.
-        OSError: A file is damaged.
+        ValueError: There are too few trajectories. Or the sensor file is invalid, names no background images (images of
+            the empty pad), or does not fit the images. Or a background image is missing or damaged.
+        OSError: Another file is damaged.
     """
     recordings = hardware.load_recordings(workdir / "dataset")
     device, sensor = sensor_file(workdir)
     if len(recordings) < LEAST:
         raise ValueError(
-            f"{recordings.folder} has {len(recordings)} confirmed trajectories, but at least {LEAST} are needed: "
-            "collect more, or confirm some with `python -m experiments.real review --confirm`"
+            f"the number of confirmed trajectories in {recordings.folder} must be >= {LEAST}, got {len(recordings)}: "
+            "collect more, or confirm existing ones with `python -m experiments.real review --confirm NUMBER`"
         )
     size = (config.image_size, config.image_size)
     with Bar() as bar:
