@@ -1,4 +1,4 @@
-"""Contacts of convex hulls with the top and the sides of a box: exact candidates, and the points chosen from them.
+"""Contacts of convex hulls with the top and the sides of a box: `collide` finds them and keeps a fixed number.
 
 MJX's own collision test of a mesh with a box is unsuitable here. MJX tests every edge of the mesh with every edge of
 the box. The edges of a small object on a large pad then have contacts with the distant rims of the pad. These contacts

@@ -48,7 +48,7 @@ Run = Callable[[np.ndarray], Rolled]  # simulates the trajectories with given in
 
 
 class Worlds(NamedTuple):
-    """Arguments of `roll_worlds` for n trajectories. All arrays have a leading axis of n."""
+    """Inputs of `roll_worlds` that differ between the n trajectories. All arrays have a leading axis of n."""
 
     fields: dict[str, Array]  # fields of MJX's model that differ between trajectories, see `scene.drawn`
     hull: Hull
@@ -76,7 +76,11 @@ def gravity_at(
 
 @functools.partial(jax.jit, static_argnames="scenario")
 def velocity_of(condition: Float[Array | np.ndarray, "n c"], scenario: Scenario) -> Float[Array, "n 6"]:
-    """Compute `scenario.velocity` for the conditions of n trajectories, (n, c).
+    """Compute the velocity of the object on its release in each of n trajectories.
+
+    Args:
+        condition: Condition of each trajectory, (n, c), as described by `Scenario.quantities`.
+        scenario: Scenario whose `velocity` is called.
 
     Returns:
         Linear and angular velocity of each object on its release, (n, 6) (m/s, rad/s, sensor frame).

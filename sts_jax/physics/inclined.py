@@ -44,8 +44,8 @@ class Inclined(Scenario):
     For a start at rest, several random poses are therefore compared (the field `tries` is their number). The object
     starts in the pose in which its contents have the largest influence on tipping.
 
-    Each trajectory draws its values uniformly from the ranges in the fields. Source: the See-Through-your-Skin paper,
-    section "Data Collection".
+    The random values of each trajectory, such as the friction, are drawn uniformly from the ranges that the fields of
+    this class define. Source: the See-Through-your-Skin paper, section "Data Collection".
     """
 
     symmetries = (0, 6)  # x -> -x

@@ -1,10 +1,12 @@
 """Simulation of several trajectories of the same body in C MuJoCo, the engine for CPUs.
 
-The results have the same meaning as those of MJX (`physics.roll`). A world is MuJoCo's state of one trajectory.
+The results have the same meaning as those of MJX (`physics.roll`). In this module, the state of one trajectory in
+MuJoCo is called a world.
 
-Every vertex of the hull is a contact point, as in `physics.contact`. Without these points, MuJoCo would keep only four
-contacts of a mesh that stands on a face, and a round base would act like a square base. The mesh itself also collides,
-because the rims of the pad and the wall touch the hull between its vertices.
+A tiny sphere at each vertex of the hull collides with the pad and the wall, so every vertex can be a contact point, as
+in `physics.contact`. Without these spheres, MuJoCo would keep only four contacts of a mesh that stands on a face, and a
+round base would act like a square base. The mesh itself also collides, because the rims of the pad and the wall touch
+the hull between its vertices.
 """
 
 from collections.abc import Sequence

@@ -55,8 +55,8 @@ class Perturbed(Scenario):
     The share of the interior that is filled (`fill`) matters most for objects with a narrow base. The default ranges of
     the fields are therefore chosen for bottles.
 
-    Each trajectory draws its values uniformly from the ranges in the fields. Source: the See-Through-your-Skin paper,
-    section "Data Collection".
+    The random values of each trajectory, such as the friction, are drawn uniformly from the ranges that the fields of
+    this class define. Source: the See-Through-your-Skin paper, section "Data Collection".
     """
 
     symmetries = tuple(range(8))

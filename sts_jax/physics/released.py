@@ -44,8 +44,8 @@ class Released(Scenario):
     rest of the weight and balances all moments. The wrench of the pad on the object in frame 0 is computed from the
     held pose and this share (`held.held_wrench`). It does not depend on the motion after the release.
 
-    Each trajectory draws its values uniformly from the ranges in the fields. Source: the See-Through-your-Skin paper,
-    section "Real-World Dataset", where the object is a small camera.
+    The random values of each trajectory, such as the friction, are drawn uniformly from the ranges that the fields of
+    this class define. Source: the See-Through-your-Skin paper, section "Real-World Dataset", where the object is a small camera.
     """
 
     symmetries = tuple(range(8))
