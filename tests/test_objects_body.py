@@ -79,7 +79,7 @@ def test_repr_describes_a_body_in_one_line_also_while_traced(jar):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"colors": np.nan}, "colors has 9,216 values that are not finite"),
+        ({"colors": np.nan}, r"colors has values that are not finite \(9,216 of 9,216\)"),
         ({"shell_mass": np.inf}, "shell_mass is inf, but all values must be finite"),
         ({"faces": 1024}, "faces has indices from 1024 to 1024, but with 1024 vertices"),
         ({"category": 8}, r"category is 8, but it must be -1 .* or an index into objects.CATEGORIES \(0 to 7\)"),

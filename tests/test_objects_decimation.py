@@ -43,7 +43,7 @@ def test_decimation_samples_the_texture(tmp_path):
     uv = np.stack([0.5 + mesh.vertices[:, 0] * 12, np.full(len(mesh.vertices), 0.5)], axis=1)
     mesh.visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
     mesh.export(tmp_path / "ball.glb")
-    with pytest.warns(UserWarning, match="decimated from 20,480 to .* faces, and its texture to one colour"):
+    with pytest.warns(UserWarning, match="decimated from 20,480 to .* faces, and its texture replaced by one colour"):
         body = objects.load(tmp_path / "ball.glb", faces=2000)
     assert body.texture.shape == (1, 1, 3)
     drawn = surface(body)

@@ -32,9 +32,10 @@ def assemble(
 ) -> Body:
     """Assemble a `Body` from a surface, its colours and its masses.
 
-    The body collides as the convex hull of the vertices, reduced to at most 64 vertices. The origin moves to the
-    centroid of this hull. The arrays are padded to a few allowed lengths, so that many bodies have arrays of equal
-    shapes. FACE_CLASSES lists these lengths for vertices and faces, and HULL_CLASSES for vertices of the hull.
+    The body collides as the convex hull of the vertices, reduced to at most 64 vertices. The centroid of this hull
+    becomes the origin of the body's coordinates. The arrays are padded to a few allowed lengths, so that many bodies
+    have arrays of equal shapes. FACE_CLASSES lists these lengths for vertices and faces, and HULL_CLASSES for vertices
+    of the hull.
 
     Args:
         vertices: Vertices of the surface (m), with +z up, at most 131,072.
@@ -80,7 +81,7 @@ def assemble(
 
     contents = np.zeros((0, 3, 3)) if interior is None else (interior[0] - origin)[interior[1]]
     if interior is not None and not solid_moments(contents).sum(axis=0)[0] > 0:
-        raise ValueError("the mesh around the contents encloses no volume: close this mesh, or turn its faces outwards")
+        raise ValueError("interior encloses no volume: close the mesh around the contents, or turn its faces outwards")
 
     size = size_class(max(len(faces), len(vertices), len(contents)), FACE_CLASSES)
     single = np.float32
@@ -111,16 +112,17 @@ def corner_normals(
 
     The normal at a corner is a weighted mean of the normals of the faces that meet at the vertex of the corner. The
     mean includes a face if the angle between the normal of this face and the normal of the corner's own face is less
-    than `crease`. The weight of a face is the interior angle of this face at the vertex.
+    than `crease`. The weight of a face is the interior angle of this face at the vertex. A face without
+    area counts as a face with the normal (0, 0, 1) and the weight 0.
 
     Args:
         vertices: Vertices of the surface (m).
         faces: Vertex indices of each face. The surface is smooth only where faces share the index of a vertex.
-        crease: Angle between the normals of two faces (rad). At a larger angle, neither face counts in the normals of
-            the other face's corners. Default: 40 degrees.
+        crease: Smallest angle between the normals of two faces (rad) at which the edge between them is sharp. The
+            default is 40 degrees.
 
     Returns:
-        Normals of the corners. A face without area has the normal (0, 0, 1) and the weight 0.
+        Unit normal at each corner of each face.
     """
     triangles = vertices[faces]
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])

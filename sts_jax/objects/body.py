@@ -70,7 +70,7 @@ class Body:
             values = np.asarray(getattr(self, field.name))
             if values.dtype.kind == "f" and not np.isfinite(values).all():
                 number = int((~np.isfinite(values)).sum())
-                problem = f"{field.name} has {number:,} values that are not finite"
+                problem = f"{field.name} has values that are not finite ({number:,} of {values.size:,})"
                 if values.ndim == 0:
                     problem = f"{field.name} is {values}"
                 raise ValueError(f"{problem}, but all values must be finite: repair the mesh, or omit the body")
@@ -140,7 +140,7 @@ def check_category(category: object) -> None:
 
 
 def is_traced(tree: object) -> bool:
-    """Return whether any leaf of a tree is a tracer of JAX, which has no concrete value."""
+    """Return whether any leaf of a pytree is a JAX tracer instead of an array with concrete values."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 

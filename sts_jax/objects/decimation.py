@@ -43,7 +43,7 @@ def decimate(path: Path, surface: Surface, target: int) -> Surface:
             f"{path}: the mesh of {len(surface.faces):,} faces cannot be decimated to {target:,}, because it consists "
             "of too many separate parts: allow more faces (argument faces)"
         )
-    note = "" if surface.texture is None else ", and its texture to one colour per corner"
+    note = "" if surface.texture is None else ", and its texture replaced by one colour per corner of each face"
     warnings.warn(f"{path}: decimated from {len(surface.faces):,} to {len(faces):,} faces{note}", stacklevel=3)
     vertices, faces = np.asarray(vertices, float), np.asarray(faces, int)
     colors = _sampled(surface, vertices[faces], 20 * target)

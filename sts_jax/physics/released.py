@@ -45,7 +45,8 @@ class Released(Scenario):
     held pose and this share (`held.held_wrench`). It does not depend on the motion after the release.
 
     The random values of each trajectory, such as the friction, are drawn uniformly from the ranges that the fields of
-    this class define. Source: the See-Through-your-Skin paper, section "Real-World Dataset", where the object is a small camera.
+    this class define. Source: the See-Through-your-Skin paper, section "Real-World Dataset", where the object is a
+    small camera.
     """
 
     symmetries = tuple(range(8))

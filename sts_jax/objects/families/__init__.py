@@ -1,5 +1,5 @@
 """The eight families of everyday objects, one module each. `objects.procedural` lists them.
 
 The function `parts` of a family draws random dimensions and colours, and returns the parts of an object in millimetres.
-If an object has a front, such as the side with the lens or the keys, the front faces -y.
+If an object has a front, such as the lens of a camera or the buttons of a mouse, the front faces -y.
 """

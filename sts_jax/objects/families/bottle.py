@@ -1,4 +1,4 @@
-"""Bottles that are straight, tapered or have a thin neck, with a label and a cap."""
+"""Bottles with a label and a cap. The shape is straight, is tapered or has a thin neck."""
 
 import numpy as np
 

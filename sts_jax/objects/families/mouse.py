@@ -1,4 +1,4 @@
-"""Computer mice: a shell with keys and a wheel. Some have the first centimetre of a cable."""
+"""Computer mice: a shell with buttons and a wheel. Some have the first centimetre of a cable."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from sts_jax.objects.shapes import Part
 
 
 def parts(rng: np.random.Generator) -> list[Part]:
-    """Return the parts (mm) of a random computer mouse whose keys face -y."""
+    """Return the parts (mm) of a random computer mouse that lies on the table with its buttons towards -y."""
     longest = rng.uniform(60, 110)  # mm, including the first centimetre of a cable
     length = 100.0
     width = length * rng.uniform(0.54, 0.7)
