@@ -142,15 +142,15 @@ def test_cutlery_is_solid_and_of_steel(tmp_path):
 def test_missing_columns_are_named(tmp_path):
     shapenet.build(tmp_path, [], {})
     shapenet.table(tmp_path, [], [name for name in shapenet.COLUMNS if name not in ("unit", "front")])
-    with pytest.raises(ValueError, match=r"metadata\.csv: the table lacks the columns front, unit "):
+    with pytest.raises(ValueError, match=r"metadata\.csv: the table lacks columns of ShapeNetSem \(front, unit\)"):
         objects.library(tmp_path)
     shapenet.table(tmp_path, [], [name for name in shapenet.COLUMNS if name != "fullId"])
     (tmp_path / "models-OBJ").rename(tmp_path / "models")  # known by its columns alone
-    with pytest.raises(ValueError, match=r"metadata\.csv: the table lacks the columns fullId "):
+    with pytest.raises(ValueError, match=r"metadata\.csv: the table lacks columns of ShapeNetSem \(fullId\)"):
         objects.library(tmp_path)
     (tmp_path / "models").rename(tmp_path / "models-OBJ")
     shapenet.table(tmp_path, [], ["id", "class"])
-    with pytest.raises(ValueError, match="lacks the columns fullId, category, up, front, unit"):
+    with pytest.raises(ValueError, match=r"lacks columns of ShapeNetSem \(fullId, category, up, front, unit\)"):
         objects.library(tmp_path)
 
 

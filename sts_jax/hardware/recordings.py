@@ -108,10 +108,10 @@ class Recordings:
 
     @property
     def identity(self) -> str:
-        """SHA-256 checksum of the recorded trajectories.
+        """SHA-256 checksum of the confirmed trajectories.
 
-        If a trajectory is added, discarded or replaced, the recordings that `load_recordings` returns afterwards have
-        another checksum.
+        If a trajectory is confirmed, discarded or replaced, the result of the next `load_recordings` has another
+        checksum.
 
         Raises:
             FileNotFoundError: A trajectory was discarded after these recordings were loaded.
@@ -146,6 +146,7 @@ class Recordings:
             The initial visual, initial tactile, final visual and final tactile images, in this order.
 
         Raises:
+            FileNotFoundError: A trajectory was discarded after these recordings were loaded.
             DamagedFileError: A file is missing or damaged.
             ValueError: There is no confirmed trajectory.
         """
@@ -164,10 +165,10 @@ class Recordings:
 
 
 def load_recordings(folder: str | os.PathLike) -> Recordings:
-    """List the confirmed trajectories of a session.
+    """Return the confirmed trajectories of a session.
 
-    The images are read later, when a trajectory is accessed. Another process may add trajectories to the session at the
-    same time.
+    A session is a folder of trajectories that were recorded with one sensor. The images of a trajectory are read when
+    the trajectory is accessed. This function does not lock the session, so another process may add trajectories to it.
 
     Args:
         folder: Folder of the session, which contains `session.json`.
@@ -448,7 +449,7 @@ def _move(source: Path, target: Path) -> None:
     if target.exists():
         raise FileExistsError(
             f"{source} cannot be moved to {target}, which exists already: rename one of the two folders to an "
-            "unused number."
+            "unused number. If the renamed trajectory was confirmed, confirm it again with confirm_recording()."
         )
     target.parent.mkdir(parents=True, exist_ok=True)
     source.rename(target)

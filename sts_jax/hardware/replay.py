@@ -1,4 +1,4 @@
-"""`Replay`: plays back a recording of both streams, with the methods of a connected sensor."""
+"""`Replay`: plays back recorded visual and tactile images through the same methods as a connected sensor."""
 
 import bisect
 import itertools
@@ -22,7 +22,7 @@ _LATE_S = 0.25
 
 
 class Replay:
-    """A recording that is read with the methods of `STS`.
+    """A recording of visual and tactile images, which is read with the same methods as a connected sensor (`STS`).
 
     ```python
     with hardware.Replay("runs/monday") as sensor:
@@ -34,9 +34,9 @@ class Replay:
     misses images, as with a sensor, and `skipped` counts them. With `speed=None`, the replay waits for the program
     instead and returns every image.
 
-    The times of a `Shot` are times of the replay on the clock `time.monotonic`, not the recorded times. The time
-    between two images of the replay is the time between them in the recording, divided by `speed`. A replay cannot
-    switch lights, so it returns the images of both streams in the order of the recording. Only one thread at a time may
+    The times in each returned `Shot` are times of the replay on the clock `time.monotonic`, not the recorded times. The
+    time between two images of the replay is the time between them in the recording, divided by `speed`. A replay cannot
+    switch lights, so it returns visual and tactile images in the order of the recording. Only one thread at a time may
     use a replay.
 
     Attributes:
@@ -71,7 +71,10 @@ class Replay:
         if speed is not None and not (speed > 0 and math.isfinite(speed)):
             raise ValueError(f"speed must be > 0 and finite, or None, got {speed}")
         if fps is not None and not isinstance(source, tuple):
-            raise ValueError(f"fps is {fps}, but a recording has its own times: leave fps out.")
+            raise ValueError(
+                f"fps must be None for a recording, because its folder contains the time of each image, got {fps}: "
+                "leave fps out."
+            )
         self._source, self._fps = source, fps
         self._speed, self._loop = speed, loop
         self._name = " and ".join(map(str, source)) if isinstance(source, tuple) else str(source)
@@ -97,10 +100,14 @@ class Replay:
 
     @property
     def device(self) -> Device | None:
-        """The device that the sensor file in the recording describes, or None if the recording has no such file.
+        """The description of the recorded sensor, from the file `sensor.json` in the recording's folder.
+
+        None if the recording has no such file.
 
         Raises:
-            SensorFileError: The sensor file is damaged.
+            OSError: The file cannot be read or is not JSON.
+            SensorFileError: The file is damaged, incomplete or of another version. Or a background image is missing or
+                damaged.
         """
         if isinstance(self._source, tuple) or not sensor_file(self._source).exists():
             return None
@@ -246,8 +253,8 @@ class Replay:
 
         Args:
             duty: Share of tactile images, 0 to 1. `duty` and `dwell` determine whether the next returned image is
-                visual or tactile, as in `STS.stream`. Recorded images of the other kind are skipped. None: return all
-                recorded images.
+                visual or tactile, as in `STS.stream`. Recorded images of the other kind are skipped. None: no image
+                is skipped because of its kind.
             dwell: Number of successive images of the same kind, >= 1. It has no effect if `duty` is None.
 
         Returns:
@@ -339,8 +346,8 @@ class Replay:
         count = len(self._times_s)
         if not self._loop and number >= count:
             raise EndOfVideoError(
-                f"{self._name} has ended after {count} images: connect again to replay it from its start, or give "
-                "loop=True."
+                f"the replay of {self._name} has ended after {count} images: call connect() to start it again, or "
+                "create the replay with loop=True."
             )
 
     def _pair_from(self, number: int) -> tuple[int, int]:

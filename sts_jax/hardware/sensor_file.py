@@ -47,10 +47,12 @@ class WrongDeviceError(SensorFileError):
 
 @dataclasses.dataclass(frozen=True)
 class Background:
-    """A raw image of the empty pad, which is stored as a PNG file in the folder of the sensor file.
+    """The file name and the checksum of a background image, which is a raw image of the empty pad.
+
+    The image is a PNG file in the folder of the sensor file.
 
     Raises:
-        ValueError: `name` contains a folder, or `sha256` is not a checksum.
+        ValueError: `name` is empty or contains a folder, or `sha256` is not a checksum.
     """
 
     name: str  # name of the PNG file, without folder
@@ -60,7 +62,9 @@ class Background:
         if not self.name or self.name != Path(self.name).name:
             raise ValueError(f"name of a background must be a file name without a folder, got {self.name!r}")
         if not re.fullmatch("[0-9a-f]{64}", self.sha256):
-            raise ValueError(f"sha256 of {self.name} must have 64 hexadecimal digits, got {self.sha256!r}")
+            raise ValueError(
+                f"sha256 of {self.name} must have 64 hexadecimal digits in lower case, got {self.sha256!r}"
+            )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -296,8 +296,9 @@ def _factor(
         return factor * largest / extent
     if extent > PAD:
         raise ValueError(
-            f"{path}: the longest side is {extent:.3g} m, but the pad is {PAD} m wide: give longest_side (in metres), "
-            "or give scale (in metres per unit, 0.001 if the file is in millimetres)"
+            f"{path}: the longest side is {extent:.3g} m, but it must be at most {PAD} m, the width of the sensor's "
+            "pad: give longest_side (in metres), or give scale (in metres per unit, 0.001 if the file is in "
+            "millimetres)"
         )
     return factor
 
@@ -328,12 +329,13 @@ def _body(
         fault = "encloses no volume" if closed else "is not closed"
         if strict:
             raise ValueError(
-                f"{path}: the mesh {fault}: repair the mesh, or give strict=False to use its convex hull as the "
-                "interior"
+                f"{path}: the mesh {fault}: repair the mesh, or give strict=False, so that its convex hull bounds the "
+                "contents of a hollow object"
             )
         if holds:
             warnings.warn(
-                f"{path}: the mesh {fault}, so its convex hull ({hull.volume * 1e6:.3g} ml) bounds the contents",
+                f"{path}: the mesh {fault}, so its convex hull ({hull.volume * 1e6:.3g} ml) bounds the contents of the "
+                "hollow object",
                 stacklevel=3,
             )
         if len(hull.simplices) > max(len(faces), len(vertices)):  # keeps the body in its size class

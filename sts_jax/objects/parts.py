@@ -110,10 +110,10 @@ def surface_gaps(
 ) -> tuple[float, float]:
     """Compute the largest distances between a visible surface and its collision parts.
 
-    The first distance is a maximum over points of the visible surface, and the second is a maximum over points of the
-    parts. The points are all corners and 10,000 other points, and the distance of each point is exact. The true maximum
-    can lie between the points. The returned value is then too small by about half the distance between neighbouring
-    points. For a single hull, the first returned value is exact.
+    The function computes the distances of sample points. These are the corners of all triangles, 10,000 other points of
+    the visible surface and 10,000 other points of the parts. The distance of each sample point is exact, but the true
+    maximum can lie between the sample points. A returned value can therefore be too small by up to about half the
+    distance between neighbouring sample points. For a single hull, the first returned value is exact.
 
     Args:
         vertices: Vertices of the visible surface (m).
@@ -123,7 +123,8 @@ def surface_gaps(
     Returns:
         Largest distance (m) by which the surface lies outside all parts, and largest distance (m) by which the parts
         lie outside the surface. The visible surface can sink into the pad by the first distance. A contact can lie
-        outside the visible surface by up to the second distance, such as in the hollow of a bowl.
+        outside the visible surface by up to the second distance, such as in the hollow of a bowl. If the visible
+        surface is not closed, the second distance is measured on both of its sides.
     """
     points = np.concatenate([np.unique(vertices[faces].reshape(-1, 3), axis=0), _points(vertices[faces], 10_000)])
     shapes = [ConvexHull(hull) for hull in hulls]
@@ -138,7 +139,10 @@ def surface_gaps(
 
 
 def hull_gap(body: Body) -> float:
-    """Compute the largest distance (m) by which the visible surface of one body lies outside its collision parts."""
+    """Compute the largest distance (m) by which a vertex of a body's surface lies outside the body's collision parts.
+
+    For a single part, no other point of the surface lies farther outside. For several parts, use `gaps`.
+    """
     surface = np.unique(np.asarray(body.vertices, float), axis=0)
     parts = [outside_hull(surface, np.unique(part, axis=0)) for part in np.asarray(body.hulls, float)]
     return float(np.min(parts, axis=0).max())

@@ -1,4 +1,4 @@
-"""ShapeNetSem as downloaded: its table metadata.csv defines the class, size and orientation of each mesh."""
+"""Reader of the dataset ShapeNetSem. Its table metadata.csv defines the class, size and orientation of each mesh."""
 
 import csv
 import io
@@ -108,7 +108,7 @@ def _rows(table: Path) -> list[dict[str, str]]:
         missing = [name for name in _COLUMNS if name not in (reader.fieldnames or ())]
         if missing:
             raise ValueError(
-                f"{table}: the table lacks the columns {', '.join(missing)} of ShapeNetSem: download the table again"
+                f"{table}: the table lacks columns of ShapeNetSem ({', '.join(missing)}): download the table again"
             )
         try:
             rows = list(reader)

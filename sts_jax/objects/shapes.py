@@ -89,7 +89,8 @@ def sweep(path: np.ndarray, section: np.ndarray, binormal: Sequence[Number], *, 
             coordinate of an outline is along the cross product of the path's direction and `binormal`. The second
             coordinate is along `binormal`.
         binormal: Unit vector (3,), not parallel to the path.
-        closed: True if the path is closed, so that its last point is next to its first point.
+        closed: True if the path continues from its last point to its first point. `path` must not repeat the first
+            point at its end.
 
     Returns:
         One ring for each point of the path, (k, n, 3) (mm).
