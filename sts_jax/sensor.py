@@ -273,7 +273,8 @@ def _field_conditions(
         yield from _value_conditions(default, value, name, metadata)
         return
     if type(value) is not type(default):
-        raise ValueError(f"field {name} is {value!r}, but it must be a {type(default).__name__}.")
+        allowed = "Lights or Leds" if isinstance(default, Lights | Leds) else type(default).__name__
+        raise ValueError(f"field {name} is {value!r}, but it must be an instance of {allowed}.")
     for field in dataclasses.fields(default):
         inner = f"{name}.{field.name}" if name else field.name
         yield from _field_conditions(getattr(default, field.name), getattr(value, field.name), inner, field.metadata)
@@ -285,7 +286,8 @@ def _value_conditions(default: Any, value: Any, name: str, metadata: Mapping[str
     Two-dimensional values may have any number of rows, one for each light or lamp.
     """
     array, shape = _array(value), np.shape(default)
-    wanted = "a finite number" if shape == () else f"an array of finite numbers of shape {shape}"
+    rows = f"(n, {shape[1]}), with one row for each light" if len(shape) == 2 else str(shape)
+    wanted = "a finite number" if shape == () else f"an array of finite numbers of shape {rows}"
     fits = array.shape == shape or (len(shape) == 2 and array.shape[1:] == shape[1:] and len(array) > 0)
     if array.dtype.kind not in "iuf" or not fits:
         raise ValueError(f"field {name} is {value!r}, but it must be {wanted}.")

@@ -1,18 +1,20 @@
-"""Calibration of predictions: correction of the density of the final pose, and of the contrast of samples.
+"""Calibration: numbers that correct the predicted density of the final pose and set the contrast of sampled images.
 
-The encoders estimate the states of training objects better than the states of other objects. The transition is the
-network that predicts the density of the final pose. The transition learns from training objects, and its density is too
-narrow for other objects. How much too narrow the density is depends on the inputs.
+The transition is the network that predicts the density of the final pose. For each outcome, such as resting or falling
+off, the density is a mixture of Gaussians. The encoders estimate the states of training objects better than the states
+of other objects. The transition learns from training objects, and its density is too narrow for other objects. The
+necessary correction depends on the inputs.
 
 Three numbers for each subset of the inputs correct the density: an exponent of the probabilities of the outcomes, an
-exponent of the weights of the mixture, and a factor of the variances. They are temperatures in the sense of Guo et al.
+exponent of the weights of the mixtures, and a factor of the variances. They are temperatures in the sense of Guo et al.
 (2017), "On Calibration of Modern Neural Networks". The first number can make the outcomes less or more certain, because
 the predicted probabilities are often too uncertain after a short training. The other two numbers can only widen the
 density of the pose. In a fit to few objects, a narrower density often has the largest likelihood, but it covers too few
 of the true poses of other objects.
 
-A fourth number is the contrast of the samples. A larger contrast makes the outlines in the samples sharper. The fit
-chooses the contrast at which the gradient energy of the samples is nearest to that of the true images.
+A fourth number is the contrast of the sampled images. A larger contrast makes their outlines sharper. The gradient
+energy of an image is the sum of the squared differences of neighbouring pixels. The fit chooses the contrast at which
+the gradient energy of the sampled images is nearest to that of the true images.
 
 `statespace.fitting` finds the numbers on trajectories that the training did not see.
 """
@@ -49,8 +51,8 @@ def of_items(config: Config, calibration: Calibration, present: dict[str, Bool[A
     Args:
         config: Configuration of the model.
         calibration: Numbers for each subset of the inputs.
-        present: Masks `(n,)` of the inputs by name. True means that the item has the input. The density is not
-            corrected for items that have the true state code `state` as an input.
+        present: Masks `(n,)` of the inputs by name. True means that the item has the input. The density of the
+            final pose is not corrected for items that have the true state code `state` as an input.
 
     Returns:
         Numbers for each item, four arrays `(n,)`.
@@ -98,7 +100,7 @@ def predict(
 def corrected(
     final: FinalPose, outcome: Float[Array, "*n"], weight: Float[Array, "*n"], variance: Float[Array, "*n"]
 ) -> FinalPose:
-    """Apply the three numbers of a calibration to the predicted densities of the final pose.
+    """Correct the predicted densities of the final pose with the numbers of a `Calibration`.
 
     Args:
         final: Densities of n items.

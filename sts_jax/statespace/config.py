@@ -61,7 +61,7 @@ class Config:
         for name, part in (("window", 8), ("canvas", 8), ("input_size", self.image_size)):
             if getattr(self, name) % part or getattr(self, name) < part:
                 raise ValueError(
-                    f"{name} is {getattr(self, name)} pixels, but it must be a multiple of {part}"
+                    f"{name} is {getattr(self, name)} pixels, but it must be a positive multiple of {part}"
                     f"{', the image_size' if name == 'input_size' else ''}"
                 )
         if len(self.encoder) != 3 or len(self.decoder) != 3:

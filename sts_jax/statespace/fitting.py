@@ -51,8 +51,9 @@ def fit(
 
     The calibration has four values for each subset of the inputs. The first three maximise the likelihood of the true
     outcomes and final poses, multiplied by a prior that favours values near 1. The fourth value is the contrast, which
-    is the sharpness of the outlines in sampled images. The contrast is chosen out of `CONTRASTS`, so that the gradient
-    energy of the samples is nearest to the gradient energy of the true images.
+    is the sharpness of the outlines in sampled images. `fit` chooses the value in `CONTRASTS` at which the gradient
+    energy of the sampled images is nearest to that of the true images. The gradient energy of an image is the sum of
+    the squared differences of neighbouring pixels.
 
     Args:
         graphdef: Definition of the model, from `init`.
@@ -114,7 +115,10 @@ def _contrast(
 
 
 def gradient_energy(images: Float[Array, "*n h w 3"]) -> Float[Array, "*n"]:
-    """Compute the sum of the squared differences of neighbouring pixels of each image along both axes."""
+    """Compute the gradient energy of each image: the sum of the squared differences of neighbouring pixels.
+
+    The sum is over all pairs of neighbours along the rows and along the columns, and over the colour channels.
+    """
     down, across = (jnp.diff(images, axis=axis) for axis in (-3, -2))
     return jnp.sum(down**2, axis=(-3, -2, -1)) + jnp.sum(across**2, axis=(-3, -2, -1))
 

@@ -4,7 +4,8 @@ The latent describes an object in the first frame of a trajectory. It has two pa
 the shape and the mass (`statespace.state`). The appearance code, which the program calls `look`, describes all other
 properties that the images show.
 
-- An encoder for each image returns a Gaussian over both codes. The belief is the product of these Gaussians.
+- An encoder for each kind of image (visual and tactile) returns a Gaussian over both codes. The belief is the product
+  of the prior and the Gaussians of all inputs (`objective.fuse`).
 - The transition maps the belief to a density of the final pose and of the rotation from the first to the final pose.
 - The decoder renders both images of an object in a given pose, from the latent and the rotation since the first frame.
 

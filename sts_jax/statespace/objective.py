@@ -1,22 +1,23 @@
 """The loss of a state-space model.
 
-A batch has the first and the last frames of some trajectories. The inputs are from the first frame, and the targets are
-the true state in the first frame, and the images, the pose and the outcome of the last frame. The loss is the weighted
-sum of these terms. NLL is a negative log likelihood.
+A batch has the first and the last frames of some trajectories. The inputs are from the first frame. The targets
+are the true state in the first frame, and the images, the pose and the outcome of the last frame. The loss is the
+weighted sum of these terms. NLL is a negative log likelihood.
 
 - `state` and `doubt`: the squared error of the state code that each encoder estimates, and the NLL by which the encoder
   learns the variance of this error
 - `outcome` and `pose`: the NLL of the true outcome, and the NLL of the true final pose and of the rotation from the
-  first to the final pose. The transition network predicts the density from a belief, which is the Gaussian over the
-  codes that `fuse` computes. Each NLL is a mean over the beliefs from all non-empty subsets of the inputs
+  first to the final pose. The transition network predicts all three from a belief, which is the Gaussian that `fuse`
+  computes. Each NLL is a mean over the beliefs from all non-empty subsets of the inputs
 - `visual` and `tactile`: the cross-entropy of the rendered images of the last frame, minus the entropy of the targets.
   `visual` is a sum over the pixels that show the object. `tactile` is a sum over all pixels
 - `first`: the sum of the terms `visual` and `tactile`, but computed for the input images of the first frame
 - `covered`: the cross-entropy of the probability that a pixel shows the object, for both frames
 - `look`: the divergence of the appearance code from its prior, multiplied by `beta` in the loss
 
-Both frames are rendered in their true poses, so that the decoder never averages over several places of an object. The
-appearance code of a sample is drawn from the belief of a random subset of its inputs that contains an image.
+The decoder renders the object in its true pose in each of the two frames. It therefore never learns a mean of images
+for several possible poses. The appearance code of each item of the batch is drawn from a belief. This belief is from a
+random subset of the item's inputs that contains an image.
 
 Two further kinds of data contribute to some of the terms. *Views* are first frames without a trajectory. Views
 contribute to `state` and `doubt`. In `first` and `covered`, views replace the first frames of the trajectories. *Falls*

@@ -170,8 +170,8 @@ class Twin:
         if self._virtual_s:
             raise RuntimeError(
                 f"the virtual clock of this Twin has advanced to {self._virtual_s} s, but another clock can replace "
-                "the virtual clock only at 0 s: make a new Twin, and pass the new Twin to Served before you call its "
-                "methods `step`, `capture`, `set` or `ping`"
+                "the virtual clock only at 0 s: make a new Twin, and pass the new Twin to Served before any call of "
+                "`Twin.step`, `Twin.capture`, `Twin.set` or `Twin.ping`"
             )
         self._clock = clock
         self._boot(clock())
@@ -238,8 +238,8 @@ class Twin:
             fault: Fault of the kind `stall`, `repeat`, `black`, `resize` or `reboot`. `Fault` describes the kinds.
 
         Raises:
-            ValueError: The fault is of another kind, which concerns a connection. Only a served twin has connections,
-                so use `Served.inject`.
+            ValueError: The fault is of another kind. The other kinds concern a connection, and a twin has connections
+                only while `Served` runs it. Pass these faults to `Served.inject`.
         """
         if fault.kind == "reboot":
             with self._lock:
@@ -256,7 +256,7 @@ class Twin:
         else:
             raise ValueError(
                 f"fault has the kind {fault.kind!r}, which concerns a connection, but Twin.inject accepts only "
-                f"{', '.join(faults.DEVICE_KINDS)}: serve the twin, and call Served.inject"
+                f"the kinds {', '.join(faults.DEVICE_KINDS)}: pass the twin to Served, and call Served.inject"
             )
 
     def end_s(self, index: int) -> float:
@@ -269,7 +269,7 @@ class Twin:
         Frames up to the number `after` are skipped. The random part of the delay (`Imperfections.jitter_s`) is ignored.
 
         Args:
-            after: Number of the last frame to skip, or -1.
+            after: Number of the last frame to skip, or -1 to skip none.
             now_s: Earliest time of delivery on the twin's clock (s).
 
         Returns:
@@ -381,7 +381,7 @@ class Twin:
             levels: Duty cycles of the four LED channels, 0 (off) to 255 (always on).
 
         Returns:
-            The controller's answer with the applied levels, as from `hardware.Leds.set`.
+            The controller's answer with the applied levels. Its times are on the virtual clock.
 
         Raises:
             ValueError: There are not four levels, or one is out of range.
@@ -396,7 +396,7 @@ class Twin:
         The controller turns the lights off after 1 s without a request. Regular calls of this method keep them on.
 
         Returns:
-            The controller's answer with the current levels. It has the form of an answer of `hardware.Leds.ping`.
+            The controller's answer with the current levels. Its times are on the virtual clock.
 
         Raises:
             RuntimeError: The twin runs on the real clock.

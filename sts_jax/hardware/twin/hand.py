@@ -75,9 +75,10 @@ class Hand(AutomaticPerson):
         if self._now_s - self._since_s > self._patience_s or self._unseen == _UNSEEN:
             raise ValueError(
                 f"hardware.collect has shown the instruction `{view.instruction}` for "
-                f"{self._now_s - self._since_s:.1f} s (contact: {view.contact}, still: {view.still}): the "
-                "thresholds of hardware.collect do not suit the twin's images, or patience_s of Hand is too short. "
-                "Change the argument config (a GuideConfig) of hardware.collect, or increase patience_s"
+                f"{self._now_s - self._since_s:.1f} s (contact: {view.contact}, still: {view.still}, held poses in a "
+                f"row without contact: {self._unseen}, limit: {_UNSEEN}): the thresholds of hardware.collect do not "
+                f"suit the twin's images, or patience_s of Hand ({self._patience_s:g} s) is too short. Change the "
+                "argument config (a GuideConfig) of hardware.collect, or increase patience_s"
             )
 
     def action(self) -> Action | None:

@@ -68,15 +68,15 @@ class LightHistory:
             self._changes.append(_Change(time_s, self._share(last, time_s), target))
 
     def over(self, start_s: float, end_s: float) -> Light:
-        """The brightness of the LEDs between two times.
+        """Return the mean, smallest and largest brightness of the LEDs between two times.
 
         Args:
             start_s: Start of the interval (s).
             end_s: End of the interval (s), later than `start_s`.
 
         Returns:
-            The mean, smallest and largest brightness. The mean is the exact integral over the interval divided by its
-            length.
+            The three values, as shares of the full power of the LEDs, 0 to 1. The mean is the exact integral of the
+            brightness over the interval, divided by the length of the interval.
 
         Raises:
             ValueError: `start_s` is not less than `end_s`.
