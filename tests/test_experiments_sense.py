@@ -143,7 +143,7 @@ def test_a_sensor_of_a_file_is_used(box, tmp_path):
         ({"light": 1.5}, "light is 1.5"),
         ({"rest": 99}, r"--rest is 99, but it must be an index from 0 to \d+, because the object can"),
         ({"mesh": "bottle", "longest_side": 0.1}, "--longest-side is for mesh files, but bottle is an object class"),
-        ({"longest_side": 0.2}, "longest_side is 0.2 m, but the pad is 0.15 m wide"),
+        ({"longest_side": 0.2}, "longest_side is 0.2 m, but the sensor's pad is 0.15 m wide"),
         ({"scale": 100.0}, r"longest side is 4 m, but it must be at most 0.15 m, .* pad: give longest_side"),
         ({"out": "nowhere/a.png"}, "the folder nowhere of a.png does not exist"),
         ({"out": "."}, "is a folder: give the name of a picture"),

@@ -264,7 +264,7 @@ def test_hull_gap_is_the_error_of_a_hull_of_64_vertices(tmp_path):
         ({"mass": float("nan")}, "`mass` must be a positive"),
         ({"longest_side": 0.0}, "`longest_side` must be a positive"),
         ({"longest_side": -0.1}, "`longest_side` must be a positive"),
-        ({"longest_side": 0.2}, "the pad is 0.15 m"),
+        ({"longest_side": 0.2}, "pad is 0.15 m"),
         ({"longest_side": 0.004}, "longest_side is 0.004 m, but an object must be at least 0.005 m"),
         ({"scale": 0.001}, r"longest side is 0\.1 mm, but it must be at least 5 mm: .*longest_side \(in metres\)"),
         ({"category": 99}, "category is 99, but it must be -1"),
@@ -285,7 +285,7 @@ def test_arguments_out_of_range_are_refused(box, arguments, message):
     [
         ({"scale": 0.0}, "`scale` must be a positive"),
         ({"largest": -1.0}, "`largest` must be a positive"),
-        ({"largest": 0.2}, r"the pad is 0\.15 m"),
+        ({"largest": 0.2}, r"pad is 0\.15 m"),
         ({"density": 0.0}, "`density` must be a positive"),
         ({"scale": 1.0, "longest_side": 0.1}, "not both"),
         ({"faces": 2}, "`faces` must be a whole number >= 4"),

@@ -140,8 +140,9 @@ def _group(name: str) -> str:
 def users_of(name: str) -> list[str]:
     """Return the processes that have opened a device, as texts such as "process 123 (python)".
 
-    The list contains only processes whose open files the current user is allowed to see. On other systems than
-    Linux, the list is empty.
+    The list contains only processes whose open files the current user is allowed to see. If the current process is
+    the only one, the list contains the text "another part of this process". On systems other than Linux, the list is
+    empty.
 
     Args:
         name: Path of the device, such as `/dev/ttyACM0`.

@@ -35,10 +35,10 @@ _GRACE_S = 0.2  # s by which the wait for a frame may exceed the deadline, so th
 class ProvenFrames:
     """Switches the lights of a connected sensor, and selects frames for which the state of the lights is proven.
 
-    The lights are off in the visual stream and on in the tactile stream. The class stores the controller's
-    answer to the last switch of the lights, and the last frame before this switch. After the switch, the class counts
-    successive frames that show the new state of the lights, up to a count of two. Only one thread may take images.
-    Other threads may only call `stop`.
+    The lights are off in the visual stream and on in the tactile stream. After each switch of the lights, the frames
+    are compared with a frame from before the switch, until two successive frames show the new state of the lights.
+    After each selected frame, the controller must confirm that the lights have not changed since the switch. Only one
+    thread may take images. Other threads may only call `stop`.
     """
 
     def __init__(
@@ -158,9 +158,10 @@ class ProvenFrames:
         slowest_s = max(found.visual_s, found.tactile_s)
         if slowest_s > watch_s - period_s:
             raise LightError(
-                f"the image was still changing at the end of the measurement, {slowest_s:.2f} s after the lights were "
-                f"switched (watch_s is {watch_s:.2f}): keep the scene at rest and lock the camera's exposure. If the "
-                "lights are slow, pass longer times as STS(settling=Settling(visual_s, tactile_s))."
+                f"the image was still changing at the end of the measurement, about {slowest_s:.2f} s after the lights "
+                f"were switched (frames were collected for {watch_s:.2f} s): keep the scene at rest and lock the "
+                "camera's exposure. If the lights are slow, pass their settling times as "
+                "STS(settling=Settling(visual_s, tactile_s))."
             )
         return found
 
@@ -271,7 +272,7 @@ class ProvenFrames:
                     self._watched("tactile" if stream == "visual" else "visual", settled_s)
                     lit = self._set(stream)
                 checked_s = time.monotonic()
-        raise LightError("the taking of images was stopped by stop(): call resume() before the next image.")
+        raise LightError("stop() interrupted the wait for a frame: call resume() before you take the next image.")
 
     def _light_error(self, stream: Stream) -> LightError:
         remedy = "check that the LEDs light up, that the camera's exposure is locked, and that enough frames arrive"

@@ -145,7 +145,10 @@ class Device:
         return self.exposure_visual, self.exposure_tactile
 
     def camera_config(self, source: str | None = None) -> CameraConfig:
-        """Return the configuration that the camera had when this device was measured.
+        """Return the camera configuration that this `Device` describes, with the exposure of the visual stream.
+
+        If the source is a stream or a video file, the configuration contains only the image size and the frame rate,
+        and `lock` is False.
 
         Args:
             source: Another path or URL of the same camera, such as its URL with a password. None: the path or URL in
@@ -312,10 +315,10 @@ class Device:
 
 
 def sensor_file(path: str | os.PathLike) -> Path:
-    """Return the path of a sensor file.
+    """Return `path` if it ends in .json, otherwise the path of `sensor.json` in the folder `path`.
 
     Args:
-        path: Path of the file, ending in .json, or of the folder that contains `sensor.json`.
+        path: Path of the sensor file, or of its folder.
     """
     path = Path(path)
     return path if path.suffix.lower() == ".json" else path / NAME

@@ -29,7 +29,10 @@ class SessionError(OSError):
 
 @dataclasses.dataclass(frozen=True)
 class Origin:
-    """The identity of a sensor, which is stored with its images. All images of a session have the same origin."""
+    """The identity of the sensor with which a session is recorded. The session stores the identity in `session.json`.
+
+    All images of a session have the same origin.
+    """
 
     camera: str  # path in /dev/v4l/by-id, or URL without user name, password and port
     leds: str  # serial number of the LED controller
@@ -75,7 +78,8 @@ class Session:
     """A folder to which trajectories are added.
 
     A trajectory consists of an initial pair of images, in which an object is held on the pad, and a final pair, in
-    which the released object is at rest.
+    which the released object is at rest. Each pair consists of a visual image, taken with the lights off, and a tactile
+    image, taken with the lights on.
 
     ```python
     with Session.open("runs/real/dataset", Origin.of(sensor)) as session:
@@ -93,9 +97,9 @@ class Session:
     because the disk is full, the thread tries again every second, and `problem` describes the error.
 
     Changes (pairs of images, confirmations and discards) wait in memory until they are on disk. At most 6 changes can
-    wait, which is enough for two trajectories. If 6 changes wait, `save` and `confirm` raise a `SessionError`. To avoid
-    this error, call `check_ready` before each trajectory. It raises a `SessionError` unless the session can accept all
-    changes of the trajectory.
+    wait, which is enough for two trajectories. If 6 changes wait, `save`, `confirm` and `discard` raise a
+    `SessionError`. To avoid this error, call `check_ready` before each trajectory. It raises a `SessionError` unless
+    the session can accept all changes of the trajectory.
     """
 
     def __init__(self, folder: Path, lock: contextlib.ExitStack, settling: Settling | None):
@@ -177,7 +181,8 @@ class Session:
         """
         if (problem := self.problem) is not None:
             raise SessionError(
-                f"cannot start a new trajectory, because {self.waiting} changes are not on disk yet: {problem}"
+                f"cannot start a new trajectory, because the last attempt to write failed: {problem} "
+                f"Number of changes that are not on disk yet: {self.waiting}."
             )
         if (waiting := self.waiting) > _QUEUE - _JOBS_OF_TRAJECTORY:
             raise SessionError(
@@ -204,7 +209,7 @@ class Session:
             number: Number of the trajectory, from `begin`.
             end: "initial" if the images show the object while it is held, "final" if they show the object at rest after
                 its release.
-            pair: The images.
+            pair: The visual and the tactile image.
 
         Raises:
             SessionError: The session is closed, or its queue is full because 6 changes (image pairs, confirmations and

@@ -51,7 +51,7 @@ class Refusal:
 
 
 def asked(config: CameraConfig) -> dict[str, float]:
-    """Return the camera settings that a configuration fixes: exposure, gain, white balance or focus, by field name."""
+    """Return the values of `exposure`, `gain`, `white_balance` and `focus` that are not None, by field name."""
     values = {setting.field: getattr(config, setting.field) for setting in _SETTINGS}
     return {field: value for field, value in values.items() if value is not None}
 

@@ -1,4 +1,4 @@
-"""The settling time: the time after a switch of the lights until the frames show only the state after the switch."""
+"""The settling time: the time from switching the lights on or off until the frames show only the new state."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ class NoContrastError(RuntimeError):
 
 @dataclasses.dataclass(frozen=True)
 class Settling:
-    """The two settling times: one after the lights are switched off, and one after the lights are switched on.
+    """The settling times: `visual_s` after the lights are switched off, and `tactile_s` after they are switched on.
 
     A settling time begins when the LED controller acknowledges that it has switched the lights. Frames that arrive
     during the settling time are discarded, because these frames may still show the previous state of the lights.

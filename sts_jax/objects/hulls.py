@@ -100,7 +100,9 @@ def support(body: Body) -> Float[np.ndarray, "128"]:
         ValueError: `body` holds several stacked bodies.
     """
     if np.ndim(body.hulls) != 3:
-        raise ValueError(f"hulls has the shape {np.shape(body.hulls)}, but one body has (p, h, 3): pass a single body")
+        raise ValueError(
+            f"body.hulls has the shape {np.shape(body.hulls)}, but it must be (parts, vertices, 3): pass a single body"
+        )
     points = np.asarray(body.hulls, np.float64).reshape(-1, 3)
     return (points @ DIRECTIONS.T.astype(np.float64)).max(axis=0).astype(np.float32)
 

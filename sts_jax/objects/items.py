@@ -1,4 +1,4 @@
-"""Records of a collection of mesh files: an item before loading, an entry after loading, and the library of items."""
+"""Dataclasses for a folder of mesh files: `Item` (one file), `Entry` (a loaded item) and `Library` (all items)."""
 
 import dataclasses
 from pathlib import Path

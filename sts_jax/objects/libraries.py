@@ -1,8 +1,8 @@
 """Collections of mesh files: ShapeNetSem as downloaded, or any folder of meshes with one sub-folder per class.
 
-`library` lists the objects of a folder without opening a mesh. `read` loads one object as a `Body`. `survey` reads all
-objects once, fills the cache if there is one, and lists each object with its size or its error. An object that cannot
-be loaded does not stop `survey` and `bodies`.
+`library` lists the objects of a folder without opening a mesh. `read` loads one object, and `bodies` loads several.
+`survey` loads all objects once, fills the cache if there is one, and lists each object with its size or its error.
+`bodies` and `survey` continue after an object that cannot be loaded.
 """
 
 import dataclasses
@@ -68,7 +68,7 @@ def library(
         faces: Largest number of faces and of vertices, at least 4. Larger meshes are decimated, which needs the package
             fast-simplification.
         largest: Upper limit for the longest side (m), from 5 mm to 0.15 m. Larger objects are scaled down to this
-            limit.
+            limit. Has no effect if `longest_side` is given.
         parts: If True, objects whose convex hull reaches more than 2 mm outside the surface are decomposed into convex
             parts. This takes about ten seconds per object and needs the package coacd.
 

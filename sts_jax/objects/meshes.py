@@ -57,7 +57,7 @@ def rotation(up: Sequence[float], front: Sequence[float]) -> Float[np.ndarray, "
     if not np.linalg.norm(across) > 1e-3 * np.linalg.norm(y):
         raise ValueError(
             f"front is {tuple(front)} and up is {tuple(up)}, but they must not be parallel, and front must not be "
-            "(0, 0, 0)"
+            "(0, 0, 0): give a front direction perpendicular to up"
         )
     y = across / np.linalg.norm(across)
     return np.stack([np.cross(y, z), y, z])
@@ -84,9 +84,9 @@ def load(
     """Load a mesh file as a body. All meshes of the file are merged into one.
 
     The mesh frame is the file's frame, rotated by `up` and `front`. Its origin is the centroid of the collision hull.
-    The collision hull represents the body in collisions, unless `parts` is True. The collision hull is the convex hull
-    of the mesh, reduced to at most 64 vertices. `hull_gap` measures how far the surface lies outside the collision
-    hull. Surfaces that are not closed are visible from both sides.
+    The collision hull is the convex hull of the mesh, reduced to at most 64 vertices. It represents the body in
+    collisions, unless `parts` is True. `hull_gap` measures how far the surface lies outside the collision hull.
+    Surfaces that are not closed are visible from both sides.
 
     The albedo at a point of a face is the texture's value times the interpolated colour of the face's corners, in
     linear light. Textures, 8-bit colours and the diffuse colour `Kd` of an OBJ file are read as sRGB. Colour factors
@@ -100,7 +100,8 @@ def load(
             size. Must be None if `scale` is given.
         scale: Length of one unit of the file (m). None is 1 m.
         largest: Upper limit of the longest side (m), from 5 mm to 0.15 m. A larger mesh is scaled down to this limit
-            with a warning. None raises an error for a mesh that is longer than 0.15 m, the width of the pad.
+            with a warning. None raises an error for a mesh that is longer than 0.15 m, the width of the pad. Has no
+            effect if `longest_side` is given.
         mass: Mass of the body (kg), spread over its surface. The body then has no contents. None computes the mass of
             the shell from `density`.
         density: Mass of the shell per area (kg/m^2), if `mass` is None.
@@ -154,7 +155,7 @@ def load(
     corners = np.concatenate([_corners(path, piece) for piece in pieces]) @ turn.T
     if not np.isfinite(corners).all():
         bad = int((~np.isfinite(corners)).any(axis=(1, 2)).sum())
-        raise ValueError(f"{path}: {bad} faces have NaN or infinite vertices: repair the mesh")
+        raise ValueError(f"{path}: the mesh has NaN or infinite vertices in {bad} of its faces: repair the mesh")
     surface = merge(path, corners * _factor(path, corners, longest_side, scale, largest), *albedo(path, pieces))
     if faces is not None and max(len(surface.faces), len(surface.vertices)) > faces:
         surface = decimate(path, surface, faces)
@@ -182,7 +183,7 @@ def _check_arguments(
             raise ValueError(f"{path}: the argument `{name}` must be a positive number of {unit}, got {value!r}")
     for name, value in (("longest_side", longest_side), ("largest", largest)):
         if value is not None and value > PAD:
-            raise ValueError(f"{path}: {name} is {value} m, but the pad is {PAD} m wide: give at most {PAD}")
+            raise ValueError(f"{path}: {name} is {value} m, but the sensor's pad is {PAD} m wide: give at most {PAD}")
         if value is not None and value < SMALLEST:
             raise ValueError(
                 f"{path}: {name} is {value} m, but an object must be at least {SMALLEST} m long: give at least "

@@ -1,6 +1,7 @@
 """Model of the gel as a bed of independent springs, and the equilibrium of an object on the gel.
 
-In equilibrium, the pressure of the springs has the Fz, Mx and My of the wrench that the pad exerts on the object.
+In equilibrium, the pressure of the springs produces the force Fz and the moments Mx and My of the wrench that the pad
+exerts on the object.
 
 An object is given by the heights of its underside above the gel's undeformed face (m), one height for each cell of the
 gel's grid. Heights are negative where the object presses into the gel. Row 0 has the smallest y, and column 0 has the
@@ -102,7 +103,7 @@ def indent(gel: Gel, heights: Float[Array, "r c"]) -> Equilibrium:
 
 
 def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) -> Equilibrium:
-    """Find the equilibrium of an object: the depth and tilts at which the gel's pressure has the given Fz, Mx and My.
+    """Find the depth and the tilts of an object at which the pressure of the gel produces the given Fz, Mx and My.
 
     The gel is a grid of cells, and each cell is an independent spring. Let h be the height of the object above the cell
     whose centre has the coordinates x and y. The object sinks by d. It also turns by a small angle a about the x axis,
@@ -132,10 +133,10 @@ def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) ->
 
     Returns:
         The equilibrium. If `Fz <= 0`, there is no motion and no pressure, and `balanced` is True. If no equilibrium
-        exists within the limits of depth and tilt, the result lies within these limits and `balanced` is False. This
-        happens if the object's lowest point is more than `Gel.max_depth` above the gel, if the centre of pressure of
-        the wrench lies outside the object's footprint or outside the pad, or if the load needs more depth or tilt
-        than the limits allow.
+        exists within the limits of depth (`Gel.max_depth`) and tilt (`Gel.max_tilt`), the result lies within these
+        limits and `balanced` is False. This happens if the object's lowest point is more than `Gel.max_depth` above
+        the gel, if the centre of pressure of the wrench lies outside the object's footprint or outside the pad, or if
+        the load needs more depth or tilt than the limits allow.
     """
     force = wrench[2]
     pressed = force > 0

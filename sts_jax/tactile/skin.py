@@ -1,4 +1,4 @@
-"""Image of the lit skin: smoothing of the imprint, far and near lights, shadows, Phong reflectance, darkening.
+"""Image of the lit skin: smoothing of the imprint, directional and point lights, shadows, Phong reflectance, darkening.
 
 Images are float32, (height, width, 3), and not clipped to [0, 1]. `sense` clips them as its last step.
 """
