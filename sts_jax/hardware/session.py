@@ -170,7 +170,9 @@ class Session:
     def problem(self) -> str | None:
         """Message of the error that prevents writing at present, or None."""
         with self._changed:
-            return None if self._error is None else f"{self._error} The session tries to write again every second."
+            if self._error is None:
+                return None
+            return f"{str(self._error).rstrip('.')}. The session tries to write again every second."
 
     def check_ready(self) -> None:
         """Raise an error unless the session can accept a whole trajectory now.

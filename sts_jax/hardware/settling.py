@@ -115,7 +115,8 @@ def switched_share(look: Thumbnail, before: Thumbnail, change: Thumbnail) -> flo
     Args:
         look: Thumbnail of the image.
         before: Thumbnail of an image before the switch.
-        change: Thumbnail after an earlier switch in the same direction, minus the thumbnail before that switch.
+        change: Effect of a complete switch: an earlier thumbnail with the lights after the switch, minus an earlier
+            thumbnail with the lights before the switch.
 
     Returns:
         0 if the image shows the lights before the switch, and 1 if it shows the lights after the switch. The result is

@@ -12,7 +12,11 @@ Stream = Literal["visual", "tactile"]
 
 
 class LightError(RuntimeError):
-    """An image of the requested stream, with the lights in the right state, could not be taken in time."""
+    """No image with the requested lights could be taken in time, or the settling times could not be measured.
+
+    The lights must be off in a visual image and on in a tactile image. The settling time is the time after a switch of
+    the lights during which frames may still show the previous state of the lights.
+    """
 
 
 class NotStillError(TimeoutError):
@@ -21,10 +25,11 @@ class NotStillError(TimeoutError):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Shot:
-    """An image of one stream, with the start and the end of a time interval in which the lights did not change.
+    """An image of the visual stream (lights off) or of the tactile stream (lights on).
 
     The lights did not change between the times `before.acknowledged_s` and `until_s`. The frame arrived between these
-    times, at least one settling time after `before.acknowledged_s`, so it does not show earlier levels of the lights.
+    times, at least one settling time after `before.acknowledged_s`. Frames that arrive during the settling time may
+    still show the previous levels of the lights.
     """
 
     image: UInt8[np.ndarray, "height width 3"]  # RGB, raw and uncropped, read-only

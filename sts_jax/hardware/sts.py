@@ -30,7 +30,7 @@ _NOISE = 8.0  # multiple of the median change that counts as still too. The nois
 
 
 class FoundSensors(NamedTuple):
-    """The devices of this machine from which an `STS` can be made."""
+    """The cameras and the serial ports of this machine. An `STS` needs one camera and one serial port."""
 
     cameras: list[FoundCamera]  # cameras, as `find_cameras` lists them
     ports: list[Port]  # serial ports to which an LED controller may be connected, as `find_controllers` lists them
@@ -521,8 +521,8 @@ def first_still(shots: Iterable[Shot], timeout_s: float, window_s: float) -> Sho
         if shot.time_s - started_s > timeout_s:
             break
     raise NotStillError(
-        f"within {timeout_s:g} s, there was no period of {window_s:g} s without movement. A part of the last image "
-        f"differs by {change:.0f} of 255 from an earlier image, and at most {allowed:.0f} is allowed. "
+        f"within {timeout_s:g} s, there was no period of {window_s:g} s without movement. The largest difference "
+        f"between the last image and an earlier image is {change:.0f} of 255, and up to {allowed:.0f} counts as still. "
         "Keep the scene at rest, raise timeout_s, or check whether the light of the room changes."
     )
 

@@ -1,4 +1,4 @@
-"""`Twin`: the LED controller and the camera of a simulated sensor on one clock."""
+"""`Twin`: a simulated sensor, whose LED controller and camera share one clock."""
 
 import dataclasses
 import math
@@ -39,7 +39,10 @@ class State:
 
 
 class Made(NamedTuple):
-    """One frame of the twin's camera: its ground truth and its JPEG image."""
+    """One frame of a `Twin` (a simulated sensor): its ground truth and its JPEG image.
+
+    The ground truth contains the times of the exposure, the brightness of the LEDs, and the pose of the object.
+    """
 
     exposure: Exposure  # ground truth of the frame
     jpeg: bytes  # image of the frame, as a client receives it

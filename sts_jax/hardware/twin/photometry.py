@@ -136,7 +136,7 @@ class Blender:
         return Ends(self._end(visual), self._end(tactile))
 
     def blend(self, ends: Ends, light: float) -> np.ndarray:
-        """Make a frame without noise.
+        """Mix the two images in `ends` into a camera frame without noise.
 
         If `Imperfections.leakage` and `Imperfections.vignetting` are 0 and there is no lens distortion, the frame
         equals the image of `sts_jax.expose` up to rounding.
@@ -154,7 +154,7 @@ class Blender:
         return self._to_srgb[self._mixed(ends, light)]
 
     def frame(self, ends: Ends, light: float) -> np.ndarray:
-        """Make a frame with the read noise and the shot noise of `Imperfections`.
+        """Mix the two images in `ends` into a camera frame, and add the read noise and shot noise of `Imperfections`.
 
         Args:
             ends: Images of the scene, as `Blender.ends` returns them.
@@ -194,7 +194,7 @@ class Blender:
         """Convert one sRGB image to linear light, uint16, and apply the lens distortion and the vignetting."""
         image = np.asarray(image)
         if image.ndim != 3 or image.shape[2] != 3:
-            raise ValueError(f"image must have the shape (height, width, 3), got {image.shape}")
+            raise ValueError(f"visual and tactile must have shape (height, width, 3), but one has shape {image.shape}")
         linear = self._to_linear[np.round(np.clip(image, 0, 1) * _FULL).astype(np.uint16)]
         if self._warp is not None:
             linear = self._warp.apply(linear)
@@ -215,12 +215,13 @@ def encode(image: np.ndarray, quality: int) -> bytes:
         quality: Quality of OpenCV's encoder, 1 to 100.
 
     Raises:
-        ValueError: OpenCV cannot encode the image.
+        ValueError: OpenCV cannot encode the image, for example because a side is longer than 65500 pixels.
     """
     done, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
         raise ValueError(
-            "image must be uint8 of shape (height, width, 3), so that OpenCV can encode it as JPEG, got "
+            "image must be uint8 of shape (height, width, 3), with height and width of at most 65500 pixels, so that "
+            "OpenCV can encode it as JPEG, got "
             f"{image.dtype} of shape {image.shape}"
         )
     return data.tobytes()

@@ -1,4 +1,4 @@
-"""The serial port of the twin's LED controller, which is a pseudo-terminal."""
+"""A pseudo-terminal that acts as the serial port of the twin's LED controller."""
 
 import contextlib
 import os

@@ -61,7 +61,7 @@ class Scene(abc.ABC):
 
         Args:
             time_s: Time on the twin's clock (s). The twin computes each frame only after the exposure of this frame, so
-                `time_s` is in the past. If a few commands have changed the scene since `time_s`, the returned state
+                `time_s` is in the past. A few commands may have changed the scene since `time_s`. The returned state
                 must not include these changes.
         """
 
@@ -83,7 +83,7 @@ class Scene(abc.ABC):
     def prepare(self, command: str, blender: Blender) -> None:  # noqa: B027, few scenes need it
         """Render the images that a command will need, so that later calls of `Scene.ends` return at once.
 
-        This method may be called from any thread.
+        This method may be called from any thread. The base class does nothing.
 
         Args:
             command: `hold` holds an object on the pad, `release` lets it go, and `clear` takes it away.
@@ -109,8 +109,8 @@ class Scene(abc.ABC):
     def start(self, blender: Blender) -> None:  # noqa: B027, few scenes need it
         """Start a thread that renders images before they are needed.
 
-        `Served` calls this method, because a served twin runs on the real clock. A twin on its virtual clock does not
-        need the thread.
+        The base class does nothing. `Served` calls this method, because a served twin runs on the real clock. A twin on
+        its virtual clock does not need the thread.
 
         Args:
             blender: The twin's `Blender` instance. The method `Blender.ends` converts the rendered images.

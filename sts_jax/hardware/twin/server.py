@@ -1,4 +1,4 @@
-"""`Served`: serves a twin on the real clock, with a serial port and a camera stream."""
+"""`Served` runs a twin on the real clock, and offers its serial port and camera stream to other processes."""
 
 import ipaddress
 import os
@@ -24,9 +24,9 @@ class Served:
         input("Press Enter to stop.")
     ```
 
-    The server runs in threads of this process. There is one thread each for the serial port, for the camera, for the
-    rendering, and for holding and releasing the object at random times (argument `release_every` of `Twin`). Each
-    HTTP connection has another thread. `close` stops all threads.
+    The server runs in threads of this process. The serial port, the camera, the rendering, the HTTP server and each
+    HTTP connection have a thread of their own. One more thread holds and releases the object at random times if the
+    argument `release_every` of `Twin` is given. `close` stops all threads.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class Served:
 
     @property
     def description(self) -> str:
-        """A text of five lines: all addresses, and the machines that can connect to them."""
+        """A text of five lines: the serial port, the URLs of the server, and whether other machines can connect."""
         host = str(self._web.server_address[0])
         reach = (
             f"{host} is the loopback interface: only this machine can connect."

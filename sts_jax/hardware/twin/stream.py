@@ -1,4 +1,4 @@
-"""The HTTP server of a twin. It sends the camera's frames as motion JPEG and the twin's state, and takes commands."""
+"""The HTTP server of a twin, which sends the camera stream (motion JPEG) and the twin's state, and takes commands."""
 
 import contextlib
 import dataclasses
@@ -53,7 +53,7 @@ class CameraThread:
             self._clients -= 1
 
     def following(self, index: int) -> Made | None:
-        """Return the frame that a client receives next. If there is no such frame yet, wait for a frame up to 0.1 s.
+        """Return the frame that a client receives next. If no such frame exists yet, wait for it, at most 0.1 s.
 
         Args:
             index: Number of the frame that the client received last, or -1.
