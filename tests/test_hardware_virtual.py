@@ -221,3 +221,22 @@ def test_a_guide_that_waits_for_ever_ends_with_an_error(tmp_path):
         collected(Spots(), tmp_path / "impatient", 1, patience_s=0.1)
     with pytest.raises(ValueError, match="patience_s must be > 0, got 0"):
         collected(Spots(), tmp_path / "none", 1, patience_s=0.0)
+
+
+@pytest.mark.parametrize(
+    ("image", "found"),
+    [
+        (np.zeros((4, 4, 3)), r"float64 of shape \(4, 4, 3\)"),
+        (np.zeros((0, 4, 3), np.uint8), r"uint8 of shape \(0, 4, 3\)"),
+        (np.zeros((65501, 1, 3), np.uint8), r"uint8 of shape \(65501, 1, 3\)"),
+    ],
+)
+def test_an_image_that_jpeg_cannot_represent_is_refused(image, found):
+    with pytest.raises(ValueError, match=rf"image must be uint8 .* from 1 to 65500 pixels, got {found}"):
+        photometry.encode(image, 90)
+
+
+@pytest.mark.parametrize("data", [b"", b"abc", b"\x89PNG\r\n\x1a\n"])
+def test_bytes_that_are_no_jpeg_are_refused(data):
+    with pytest.raises(ValueError, match=f"but its {len(data)} bytes cannot be decoded"):
+        photometry.decode(data)

@@ -11,6 +11,8 @@ _FULL = 65535  # uint16 value of full-scale linear light
 # Drawing noise for every frame is too slow, so one array of random numbers serves all frames. The array is longer than
 # a frame by this number, and each frame starts at another position in it.
 _SPARE = 1 << 20
+_LONGEST = 65500  # pixels, longest side of an image that OpenCV's JPEG encoder accepts
+_JPEG = b"\xff\xd8\xff"  # first bytes of a JPEG image
 _STRIP = 1 << 18  # number of values that are processed at once, so that they stay in the processor's cache
 
 
@@ -215,15 +217,15 @@ def encode(image: np.ndarray, quality: int) -> bytes:
         quality: Quality of OpenCV's encoder, 1 to 100.
 
     Raises:
-        ValueError: OpenCV cannot encode the image, for example because a side is longer than 65500 pixels.
+        ValueError: The image has another type or shape, no pixels, or a side of more than 65500 pixels.
     """
-    done, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
-    if not done:
+    fits = image.dtype == np.uint8 and image.ndim == 3 and image.shape[2] == 3
+    if not fits or not all(1 <= side <= _LONGEST for side in image.shape[:2]):
         raise ValueError(
-            "image must be uint8 of shape (height, width, 3), with height and width of at most 65500 pixels, so that "
-            "OpenCV can encode it as JPEG, got "
-            f"{image.dtype} of shape {image.shape}"
+            f"image must be uint8 of shape (height, width, 3), with a height and a width from 1 to {_LONGEST} pixels, "
+            f"got {image.dtype} of shape {image.shape}"
         )
+    _, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
     return data.tobytes()
 
 
@@ -233,7 +235,7 @@ def decode(data: bytes) -> np.ndarray:
     Raises:
         ValueError: The bytes are not a JPEG image.
     """
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data.startswith(_JPEG) else None
     if image is None:
         raise ValueError(f"data must be a JPEG image, but its {len(data)} bytes cannot be decoded")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
