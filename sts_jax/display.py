@@ -152,7 +152,10 @@ def save(path: str | os.PathLike[str], thing: Frame | Body | Trajectory | ArrayL
         data = io.BytesIO()
         np.savez_compressed(data, allow_pickle=False, **arrays)
     else:
-        raise ValueError(f"path is {str(path)!r}, but it must end in .npz (arrays) or .png (picture)")
+        raise ValueError(
+            f"path is {str(path)!r}, but it must end in .npz (for a Frame, Body or Trajectory) or .png (for a Frame or "
+            "an image)"
+        )
     write_bytes(path, data.getvalue())
 
 
@@ -186,7 +189,7 @@ def load(path: str | os.PathLike[str]) -> Any:
     except Exception as error:  # A damaged zip file raises exceptions of many types.
         reason = f"{type(error).__name__}: {error}"
         raise DamagedFileError(
-            f"{path} is damaged or was not written by sts.save ({reason}). Save the item again."
+            f"{path} is damaged or was not written by this version of sts.save ({reason}). Save the item again."
         ) from error
 
 

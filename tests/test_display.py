@@ -76,7 +76,7 @@ def test_a_damaged_file_raises_an_error_unless_the_damage_is_outside_the_arrays(
             refused += 1
     assert refused > 20
     path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(DamagedFileError, match=r"frame\.npz is damaged or was not written by sts\.save"):
+    with pytest.raises(DamagedFileError, match=r"frame\.npz is damaged or was not written by this version"):
         sts.load(path)
 
 

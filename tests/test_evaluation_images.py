@@ -62,7 +62,7 @@ def test_the_truth_has_skill_one_and_the_constant_zero():
 
 
 def test_a_missing_baseline_and_a_wrong_shape_are_refused():
-    with pytest.raises(ValueError, match="`predictions` lacks copy of the input"):
+    with pytest.raises(ValueError, match="`predictions` lacks 'copy of the input'"):
         evaluation.image_summary({CONSTANT: BASE[CONSTANT]}, TEST)
     with pytest.raises(ValueError, match=r"'small': visual has shape \(5, 4, 4, 3\)"):
         evaluation.image_summary({**BASE, "small": Predicted(visual=np.zeros((5, 4, 4, 3)))}, TEST)

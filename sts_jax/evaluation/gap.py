@@ -57,9 +57,9 @@ class Distance(NamedTuple):
 
 
 def pixel_errors(real: np.ndarray, simulated: np.ndarray, group: np.ndarray) -> PixelErrors:
-    """Compute the differences between real and simulated images that show the same object in the same pose.
+    """Compute the MAE, RMSE, PSNR and SSIM between real and simulated images of the same objects in the same poses.
 
-    Each difference has a 95 % interval from a bootstrap that draws whole trajectories with replacement.
+    Each value has a 95 % interval from a bootstrap that draws whole trajectories with replacement.
 
     Args:
         real: Real images, uint8 `(n, height, width, 3)`.
@@ -90,7 +90,7 @@ def pixel_errors(real: np.ndarray, simulated: np.ndarray, group: np.ndarray) -> 
 
 
 def features(images: np.ndarray) -> np.ndarray:
-    """Compute colours and oriented gradients in 16 cells of each image, in 4 rows of 4 cells. No network is involved.
+    """Compute colours and oriented gradients in the cells of a 4 x 4 grid on each image, without a neural network.
 
     A cell has two kinds of features. The colours are the means of the three channels. The gradients are the mean
     absolute differences of neighbouring pixels of the grey image, in four directions (horizontal, vertical and both
@@ -297,10 +297,10 @@ def _matched(
         return False
     if set(common) != set(np.r_[real_group, simulated_group]) or len(real) != len(simulated):
         raise ValueError(
-            f"real_group ({len(real)} images) and simulated_group ({len(simulated)} images) have {len(common)} "
-            "trajectories in common. The real and the simulated images must either have no trajectory in common, or "
-            "have the same trajectories and be equally many: keep only the common trajectories, or give the simulated "
-            "images other trajectory numbers"
+            f"real_group has {len(real)} images, simulated_group has {len(simulated)} images, and the number of "
+            f"common trajectories is {len(common)}. The two sets must have either no common trajectory, or the same "
+            "trajectories and the same number of images: keep only the images that have a counterpart in the other "
+            "set, or give the simulated images other trajectory numbers"
         )
     return True
 

@@ -1,4 +1,7 @@
-"""Evaluation of predicted last images of both streams. Poses are not needed, so real recordings can be used."""
+"""Evaluation of predictions of the last visual and the last tactile image of each trajectory.
+
+The evaluation needs no poses, so recordings of a real sensor can be used.
+"""
 
 from collections.abc import Mapping
 from typing import Protocol, runtime_checkable
@@ -69,8 +72,9 @@ def image_summary(
 
     Args:
         predictions: Dictionary from the name of each predictor to its predictions of the last image of each trajectory.
-            The dictionary must contain the predictors of `image_baselines`. None stands for a stream that a predictor
-            does not predict.
+            The dictionary must contain the entries "constant (mean training target)" and "copy of the input" from
+            `image_baselines`. The field `visual` or `tactile` of a prediction is None if the predictor does not predict
+            this stream.
         test: The held-out trajectories.
         num: Number of bootstrap samples.
         seed: Seed of the bootstrap.
@@ -85,11 +89,13 @@ def image_summary(
             the first image. Each metric is a dictionary of `value` and of the limits `low` and `high` of its interval.
 
     Raises:
-        ValueError: A baseline is missing, or the shape of a prediction differs from that of the true images.
+        ValueError: A required entry is missing, or the shape of a prediction differs from that of the true images.
     """
     missing = [name for name in (CONSTANT, COPY) if name not in predictions]
     if missing:
-        raise ValueError(f"`predictions` lacks {', '.join(missing)}: add the results of evaluation.image_baselines")
+        raise ValueError(
+            f"`predictions` lacks {' and '.join(map(repr, missing))}: add the results of evaluation.image_baselines"
+        )
     return {stream: _of_stream(predictions, test, stream, num, seed) for stream in STREAMS}
 
 

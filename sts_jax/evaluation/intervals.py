@@ -1,4 +1,4 @@
-"""Bootstrap of a statistic over groups of items, such as objects, and the interval of its values."""
+"""Bootstrap over groups of items, such as all trajectories of one object, and intervals of the bootstrap values."""
 
 from collections.abc import Callable
 

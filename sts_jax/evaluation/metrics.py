@@ -269,9 +269,11 @@ def log_loss(probability: np.ndarray, label: np.ndarray, floor: float = FLOOR) -
 
 
 class Reliability(NamedTuple):
-    """Comparison of the probability of the likeliest outcome with the frequency at which this outcome is true.
+    """The data of a reliability diagram: the confidence and the accuracy of the predicted outcomes in each bin.
 
-    The items (held-out trajectories) are divided into bins by this probability.
+    The items (held-out trajectories) are divided into bins by the probability of their likeliest outcome. The
+    confidence of a bin is the mean of this probability. The accuracy of a bin is the share of its items whose likeliest
+    outcome is the true one.
     """
 
     confidence: np.ndarray  # (bins,): mean probability of the likeliest outcome, NaN in empty bins
@@ -282,17 +284,20 @@ class Reliability(NamedTuple):
 def reliability(
     confidence: np.ndarray, right: np.ndarray, weight: np.ndarray | None = None, *, bins: int = BINS
 ) -> Reliability:
-    """Compare the probability of the likeliest outcome with the share of items whose likeliest outcome is the true one.
+    """Compute the data of a reliability diagram: the confidence and the accuracy of the predicted outcomes in each bin.
+
+    The items (held-out trajectories) are divided into bins by the probability of their likeliest outcome. The
+    confidence of a bin is the mean of this probability. The accuracy of a bin is the share of its items whose likeliest
+    outcome is the true one.
 
     Args:
         confidence: Probability of the likeliest outcome of each item, `(n,)`.
         right: True if the likeliest outcome is the true one, bool `(n,)`.
         weight: Weights of the items, `(n,)` (default: 1).
-        bins: Number of bins of the probability, of equal width in [0, 1] (default: 10).
+        bins: Number of bins of equal width in [0, 1] (default: 10).
 
     Returns:
-        The mean probability, the share of items whose likeliest outcome is the true one, and the number of items, for
-        each bin.
+        The confidence, the accuracy and the sum of the weights of each bin. The first two are NaN for empty bins.
     """
     w = np.ones(len(right)) if weight is None else weight
     place = np.minimum((confidence * bins).astype(int), bins - 1)

@@ -1,4 +1,4 @@
-"""Outcomes from predicted poses and images, and probabilities of outcomes from samples."""
+"""Outcomes of trajectories, such as `FELL_OFF`, from poses or images, and probabilities of outcomes from samples."""
 
 import enum
 from collections.abc import Sequence

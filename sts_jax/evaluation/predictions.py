@@ -32,12 +32,12 @@ class Predicted(NamedTuple):
 
 
 def first(predicted: Predicted, count: int) -> Predicted:
-    """The prediction for the first `count` trajectories only."""
+    """Return the prediction for the first `count` trajectories."""
     return _mapped(lambda leaves, axis: leaves[0][:count] if axis == 0 else leaves[0][:, :count], [predicted])
 
 
 def joined(parts: Sequence[Predicted]) -> Predicted:
-    """Concatenate several predictions of the same quantities into one prediction for all their trajectories."""
+    """Concatenate predictions for different trajectories. All predictions must contain the same quantities."""
     return _mapped(np.concatenate, parts)
 
 
@@ -127,8 +127,10 @@ def subsets(modalities: Sequence[str], *, state: bool = False) -> dict[str, tupl
             pose, shape and mass, which state-space models accept as an input.
 
     Returns:
-        The subsets by their descriptions, such as "from visual and pose" for the inputs ("visual", "pose"). The
-        description of the subset with the true state is "from visual and the true state".
+        A dictionary from the description of each subset to the subset. For a model with three inputs, for example, the
+        subset ("visual", "pose") has the description "from visual and pose", and the subset of all inputs has the
+        description "from all inputs". The subset ("visual", "state") has the description "from visual and the true
+        state".
     """
     usable = tuple(modalities)
     if not usable:

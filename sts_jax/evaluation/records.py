@@ -1,4 +1,4 @@
-"""The types of an evaluation: `Scores`, the errors of a predictor, and `Metric`, a number computed from them.
+"""The types of an evaluation. `Scores` holds the errors of a predictor. `Metric` computes one number from them.
 
 An item is one held-out trajectory. n is the number of items.
 """

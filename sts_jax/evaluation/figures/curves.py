@@ -92,7 +92,7 @@ def training_curves(path: Path, logs: Mapping[str, Sequence[Mapping[str, float]]
     - `loss`: The total loss.
     - `kl`: The KL divergence of the latent variables from their prior (only models of `sts_jax.mvae`).
     - `look`: The KL divergence of the appearance code from its prior (only models of `sts_jax.statespace`). This code
-        is the latent for all visible properties other than pose, shape and mass.
+        describes all visible properties of the object other than its pose and shape.
     - `visual` and `tactile`: The errors of the predicted images.
     - `state`: The squared error of the estimated pose, shape and mass in the first frame (only models of
         `sts_jax.statespace`).

@@ -36,7 +36,7 @@ def strip(
 ) -> None:
     """Draw one trajectory over time: a view from outside, the visual and tactile images, and the wrench.
 
-    Two plots below the images show the force and its moment about the sensor's origin.
+    Two plots below the images show the force of the pad on the object and its moment about the sensor's origin.
 
     Args:
         path: The PNG file to write.
@@ -44,7 +44,8 @@ def strip(
         view: Images of the scene from outside, in [0, 1], `(frames, h, w, 3)`.
         visual: Images of the visual stream, in [0, 1], `(frames, height, width, 3)`.
         tactile: Images of the tactile stream, in [0, 1], `(frames, height, width, 3)`.
-        wrench: Force (N) and moment about the sensor's origin (N m) in each frame, `(frames, 6)`.
+        wrench: Force (N) and moment about the sensor's origin (N m) of the pad on the object in each frame,
+            `(frames, 6)`.
         num: Number of frames whose images are drawn. These frames range from the first to the last one and are denser
             at the beginning. Fewer frames are drawn for a short trajectory, because no frame is drawn twice.
         title: Title of the figure.
@@ -107,7 +108,8 @@ def animation(
         view: Images of the scene from outside, in [0, 1], `(frames, h, w, 3)`.
         visual: Images of the visual stream, in [0, 1], `(frames, height, width, 3)`.
         tactile: Images of the tactile stream, in [0, 1], `(frames, height, width, 3)`.
-        wrench: Force (N) and moment about the sensor's origin (N m) in each frame, `(frames, 6)`.
+        wrench: Force (N) and moment about the sensor's origin (N m) of the pad on the object in each frame,
+            `(frames, 6)`.
         gravity: Gravity minus the acceleration of the pad (m/s^2) at each time of `time`, in the coordinates of the
             sensor, `(frames, 3)`.
         title: Title above the images.
