@@ -1,4 +1,4 @@
-"""Images that the sensor takes of an object: both streams, depth and segmentation."""
+"""Images that the sensor takes of an object: visual image, tactile image, depth and segmentation."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from sts_jax.sensor import Sensor
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Frame:
-    """Images of the sensor at one time, with the object's pose and the pressure on the gel.
+    """Images that the sensor takes at one time, with the object's pose and the pressure on the gel.
 
     The images `visual` and `tactile` are float32 in [0, 1]. Row 0 of every image is at the top.
     """
@@ -90,7 +90,7 @@ def sense(
     Args:
         sensor: Constants of the sensor.
         body: The object.
-        pose: Pose of the object, mesh frame in the sensor frame: position (m) and quaternion [w, x, y, z].
+        pose: Pose of the object's mesh frame in the sensor frame, position (m) and quaternion [w, x, y, z].
         wrench: Wrench of the pad on the object in the sensor frame: force (N) and moment about the origin (N m). None
             draws the object in the given pose.
         resolution: Height and width of the images (pixels). If the aspect ratio differs from the camera's, the images
@@ -197,8 +197,8 @@ def touch(
         Image in [0, 1]. If its shorter side has at least `Sensor.fine_below` pixels, it equals the image
         `Frame.tactile` that `sense` renders for the same imprint. For smaller images, `sense` samples more finely than
         `touch`. An invalid number in a traced `window` or in a traced constant of the sensor raises no error. Instead,
-        the image shows flat skin, and `window` counts as None. After an invalid constant, all traced constants also
-        have their default values.
+        the image shows flat skin in the default window (`window=None`). If a constant is invalid, the image is also
+        rendered with the default values of all traced constants.
 
     Raises:
         TypeError: `sensor` is not a `Sensor`, or `imprint` or `window` is not an array of numbers.
@@ -275,7 +275,8 @@ def _imprint_in_metres(imprint: Any) -> Float[Array, "h w"]:
         )
     if imprint.ndim != 2 or 0 in imprint.shape:
         raise ValueError(
-            f"imprint has the shape {imprint.shape}, but it must be (height, width). For several imprints use jax.vmap"
+            f"imprint has the shape {imprint.shape}, but it must be (height, width), both > 0. For several imprints "
+            "use jax.vmap"
         )
     return jnp.asarray(imprint, float)
 

@@ -131,7 +131,7 @@ def test_the_gain_is_the_removed_share_of_the_log_loss(scored):
 def test_a_summary_needs_every_baseline(scored):
     test, scores = scored
     few = {name: own for name, own in scores.items() if name != "nearest neighbour"}
-    with pytest.raises(ValueError, match=r"`scores` lacks nearest neighbour: pass the predictions of evaluation\.b"):
+    with pytest.raises(ValueError, match=r"`scores` lacks 'nearest neighbour': pass the predictions of evaluation\.b"):
         evaluation.summarise(few, test, num=2)
 
 

@@ -91,7 +91,7 @@ def test_a_summary_without_the_metric_is_refused(items):
     judge = evaluation.scorer(physics.Freefall(), train)
     rows = evaluation.baselines(physics.Freefall(), train, test)
     plain = evaluation.summarise({name: judge(row, test) for name, row in rows.items()}, test, num=2)
-    with pytest.raises(ValueError, match="summary lacks the metrics height_error: pass these metrics to the functions"):
+    with pytest.raises(ValueError, match="summary lacks 'height_error': pass all metrics of the table to score"):
         evaluation.full_table(plain, title="t", metrics=(HEIGHT,))
 
 

@@ -1,4 +1,4 @@
-"""Baselines, which predict without a trained model, and the names of all reference predictors."""
+"""The baselines, which predict without a trained model, and the names of the baselines and of the ceilings."""
 
 import numpy as np
 

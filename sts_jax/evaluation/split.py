@@ -12,8 +12,9 @@ def train_share(shares: Sequence[float], split: str) -> float:
 
     Args:
         shares: Shares of the objects for training, validation and test, `Collection.shares`.
-        split: `object` if whole objects are held out, `trajectory` if single trajectories are held out. As in the
-            paper, a split by trajectory has no separate validation part. The validation share is used for training.
+        split: `object` if whole objects are held out, `trajectory` if single trajectories are held out. A split by
+            trajectory has no separate validation part, as in the paper (Rezaei-Shoshtari et al. 2021). The validation
+            share is then used for training.
     """
     return shares[0] if split == "object" else 1 - shares[2]
 
@@ -26,7 +27,8 @@ def rows_of(data: Dataset, split: str = "object") -> dict[str, np.ndarray]:
     Args:
         data: The dataset.
         split: With `object`, whole objects are held out, and `Dataset.split` contains the objects of each part. With
-            `trajectory`, random trajectories are held out as in the paper, so training and test have objects in common.
+            `trajectory`, random trajectories are held out, as in the paper (Rezaei-Shoshtari et al. 2021). The training
+            and the test part then have objects in common.
 
     Returns:
         Indices of the trajectories, int `(n,)`, for each of `train`, `validation` and `test`. With

@@ -62,8 +62,8 @@ def summarise(
     missing = [name for name in BASELINES if name not in scores]
     if missing:
         raise ValueError(
-            f"`scores` lacks {', '.join(missing)}: pass the predictions of evaluation.baselines to evaluation.score, "
-            "and add the results to `scores`"
+            f"`scores` lacks {' and '.join(map(repr, missing))}: pass the predictions of evaluation.baselines to "
+            "evaluation.score, and add the results to `scores`"
         )
     names = list(scores)
     scored = {name: _count(own, len(test.object)) for name, own in scores.items()}

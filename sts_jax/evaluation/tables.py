@@ -75,7 +75,7 @@ def _check(summary: dict, metrics: Sequence[Metric]) -> None:
     missing = [metric.name for metric in metrics if metric.name not in known]
     if missing:
         raise ValueError(
-            f"summary lacks the metrics {', '.join(missing)}: pass these metrics to the functions score() and "
+            f"summary lacks {' and '.join(map(repr, missing))}: pass all metrics of the table to score() and "
             "summarise()"
         )
 
