@@ -24,6 +24,8 @@ class Surface(NamedTuple):
 def merge(path: Path, corners: np.ndarray, colors: np.ndarray, uv: np.ndarray, texture: np.ndarray | None) -> Surface:
     """Make a surface from separate faces. Corners at the same place become one vertex.
 
+    Faces that have two corners at the same place are removed.
+
     Args:
         path: Path of the mesh file, for error messages.
         corners: Corners of each face, (f, 3, 3) (m).
@@ -32,7 +34,7 @@ def merge(path: Path, corners: np.ndarray, colors: np.ndarray, uv: np.ndarray, t
         texture: Texture (t, t, 3) in linear light, or None.
 
     Raises:
-        ValueError: No face has an area.
+        ValueError: Every face has two corners at the same place.
     """
     grain = np.ptp(corners, axis=(0, 1)).max() * 1e-7
     _, first, index = np.unique(
@@ -54,7 +56,10 @@ def proper(path: Path, surface: Surface) -> Surface:
     faces = surface.faces
     kept = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
     if not kept.any():
-        raise ValueError(f"{path}: each face uses a vertex twice, so no face has an area: give a mesh with triangles")
+        raise ValueError(
+            f"{path}: every face has two corners at the same place and therefore no area: give a mesh whose faces have "
+            "three different corners"
+        )
     used, faces = np.unique(faces[kept], return_inverse=True)
     return surface._replace(
         vertices=surface.vertices[used],

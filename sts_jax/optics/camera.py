@@ -115,7 +115,7 @@ def to_pixels(
 def rays(
     camera: Camera, window: Float[Array, "4"], shape: tuple[int, int]
 ) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
-    """Slopes of the rays through the pixel centres: x / depth and y / depth.
+    """Compute the slopes x / depth and y / depth of the camera rays through the pixel centres.
 
     Args:
         camera: The camera.

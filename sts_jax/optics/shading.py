@@ -1,6 +1,7 @@
 """Shading of the view through the skin: the lit object, its shadow on the skin, and the haze of the translucent gel.
 
-All light is linear. As the last step, `to_srgb` converts an image to sRGB. Arguments of shape `*n` may have any shape.
+Light is linear RGB, unless stated otherwise. As the last step of rendering, `to_srgb` converts the image to sRGB. In
+the shapes of arguments, `*n` stands for any number of leading axes.
 """
 
 import dataclasses
@@ -111,21 +112,23 @@ def hidden_sky(
     """Compute the share of the sky that an object hides from points on the skin, which is the paint on the gel's face.
 
     Parts of the sky are weighted by the cosine of their angle to the vertical. The object is approximated by horizontal
-    slices at a few heights z, from its lowest to its highest point. Each slice has the outline of the
-    object as seen from above. Within the outline, the slice at z is opaque where the underside of the object is below
-    z, and transparent where the underside is above 2 z. In between, the opacity decreases linearly from 1 to 0.
+    slices at a few heights z, from its lowest to its highest point. Each slice has the outline of the object as seen
+    from above. Within the outline, the slice at z is opaque where the underside of the object is below z, and
+    transparent where the underside is above 2 z. In between, the opacity decreases linearly from 1 to 0.
 
     The share of the sky that a half-plane at the height z hides from a point is `f(d) = (1 - d / sqrt(d^2 + z^2)) / 2`.
     Here d is the horizontal distance from the point to the edge of the half-plane, and d is negative if the half-plane
     extends over the point. A strip between two parallel lines is the difference of two half-planes, and it hides the
-    difference of their shares. The shares are computed on a grid of about 30 x 30 cells:
+    difference of their shares. The shares are computed on a grid of about 30 x 30 cells. The share that one cell of a
+    slice hides is approximated by the share of the strip over its row times the share of the strip over its column.
+    The sum over all cells of a slice is therefore a product of three matrices:
 
         hidden = max_z Y_z slice_z X_z^T
 
-    Y_z slice_z X_z^T is a product of matrices, and the maximum over the slices is taken in each cell. slice_z is the
-    opacity of the slice in each cell, times the share of the cell inside the outline. X_z[i, j] is the share of the sky
-    that a strip over column j at the height z hides from the centre of column i. Y_z is the same matrix for rows
-    instead of columns. Quadratic splines interpolate between the cells.
+    slice_z is the opacity of the slice in each cell, times the share of the cell inside the outline. X_z[i, j] is the
+    share of the sky that a strip over column j at the height z hides from the centre of column i. Y_z is the same
+    matrix for rows instead of columns. The maximum over the slices is taken in each cell. Quadratic splines interpolate
+    between the cells.
 
     Args:
         heights: Heights of the object's underside above the gel's face (m), on a uniform grid of r rows and c columns
@@ -242,7 +245,7 @@ def shade(
     empty: Float[Array, "*n 3"],
     hidden: Float[Array, "*n"],
 ) -> Float[Array, "*n 3"]:
-    """Colour of an object as seen through the skin.
+    """Compute the colour of an object as seen through the skin.
 
     The colour is computed in four steps. `ambient`, `crease`, `crease_height`, `haze`, `tint` and `milk` are constants
     of the room.
@@ -250,8 +253,8 @@ def shade(
     1. Light on the object by Lambert's law: `albedo * (ambient + sum_m max(0, L_m . N) c_m)`, with the normal N, and
        the unit direction L_m and colour c_m of each light m.
     2. Contact shade: the share `crease * hidden * exp(-height / crease_height)` of this light is lost.
-    3. Haze: the share `exp(-height / haze)` of the remaining light is transmitted and multiplied by `tint`. The
-       background, `empty`, replaces the rest.
+    3. Haze: the share `t = exp(-height / haze)` of the remaining light is transmitted and multiplied by `tint`. The
+       share `1 - t` of the background `empty` is added.
     4. Milky skin: the share `1 - milk` of the result is transmitted. The skin adds `milk * (1 - hidden)` times the
        light of a background on which the object casts no shadow.
 

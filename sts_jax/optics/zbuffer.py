@@ -6,9 +6,9 @@ covered pixels and not with the product of faces and pixels. Each step is one sc
 depth in the high bits and the index of the face in the low bits. The choice of the face has no gradient. Values that
 are interpolated on the chosen face have gradients.
 
-Pixel coordinates are (column, row). The centre of a pixel has whole numbers. Columns increase to the right and rows
-downwards. The order of a point is a number that is smaller for nearer points and affine across a face on the screen. It
-is -1 / depth in the view of a pinhole, and depth in a parallel projection.
+Pixel coordinates are (column, row). The coordinates of a pixel's centre are whole numbers. Columns increase to the
+right and rows downwards. The order of a point is a number that is smaller for nearer points and affine across a face on
+the screen. It is -1 / depth in the view of a pinhole, and depth in a parallel projection.
 """
 
 import math
@@ -91,7 +91,7 @@ def rasterise(
     """Find the nearest face at every pixel centre.
 
     Args:
-        points: Columns and rows of the vertices on the screen (pixels). Pixel centres have whole numbers.
+        points: Columns and rows of the vertices on the screen (pixels). They are whole numbers at pixel centres.
         order: Number for each vertex, smaller for nearer vertices. It must be a linear function of column and row on
             each face, such as -1 / depth for a pinhole, or depth for a parallel projection.
         faces: Vertex indices of each face, counter-clockwise as seen from outside the object in a right-handed frame.
@@ -268,10 +268,10 @@ def barycentrics(
     column: Float[Array, "*n"],
     row: Float[Array, "*n"],
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"], Float[Array, "*n"]]:
-    """Barycentric weights of a face's three corners at points on the screen.
+    """Compute the barycentric weights of points on the screen. Each point has a face of its own.
 
     Args:
-        corners: Three pairs (column, row), one for each corner of the face (pixels).
+        corners: Columns and rows of the first, second and third corner of each point's face, as three pairs (pixels).
         column: Columns of the points (pixels).
         row: Rows of the points (pixels).
 
@@ -290,7 +290,7 @@ def barycentrics(
 
 
 def pixel_centres(shape: tuple[int, ...]) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
-    """Column and row of each pixel of an image with the shape (height, width)."""
+    """Return the column and the row of each pixel of an image with the shape (height, width)."""
     row, column = jnp.meshgrid(*(jnp.arange(n, dtype=jnp.float32) for n in shape), indexing="ij")
     return column, row
 

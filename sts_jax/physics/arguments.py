@@ -59,8 +59,8 @@ def check_condition(scenario: Scenario, start: Start) -> None:
     width, declared = start.condition.shape[-1], len(scenario.condition_scale)
     if width != declared:
         raise ValueError(
-            f"scenario.start returns a condition of {width} numbers, but scenario.quantities declares {declared}: "
-            "declare a physics.Quantity for each number or vector of the condition"
+            f"scenario.start returns a condition of length {width}, but scenario.quantities declares a condition of "
+            f"length {declared}: declare a physics.Quantity for each number or vector of the condition"
         )
 
 
@@ -91,8 +91,8 @@ def check_start(start: Start, scenario: Scenario, count: int) -> Start:
     for name, values, width in (("pose", pose, 7), ("condition", condition, len(scenario.condition_scale))):
         if values.shape != (count, width):
             raise ValueError(
-                f"start.{name} has shape {values.shape}, but it must be {(count, width)}, with one row for each of the "
-                f"{count} trajectories (the number of bodies times `num`)"
+                f"start.{name} has shape {values.shape}, but it must be {(count, width)}, with one row for each "
+                "trajectory. The number of trajectories is the number of bodies times `num`"
             )
         if not np.isfinite(values).all():
             raise ValueError(f"start.{name} has values that are not finite, but all must be finite")
@@ -134,8 +134,8 @@ def check_hidden(hidden: Hidden, count: int) -> Hidden:
         expected = (count, 3) if name == "up" else (count,)
         if values.shape != expected:
             raise ValueError(
-                f"hidden.{name} has shape {values.shape}, but it must be {expected}, with one entry for each of the "
-                f"{count} trajectories (the number of bodies times `num`)"
+                f"hidden.{name} has shape {values.shape}, but it must be {expected}, with one entry for each "
+                "trajectory. The number of trajectories is the number of bodies times `num`"
             )
         if not np.isfinite(values).all():
             raise ValueError(f"hidden.{name} has values that are not finite, but all must be finite")
