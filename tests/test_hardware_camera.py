@@ -507,8 +507,8 @@ def test_a_camera_that_is_open_twice_in_one_process_is_refused(server):
     [
         ("empty.avi", b"", "is empty"),
         ("noise.avi", bytes(range(256)) * 20, "cannot be read as a video"),
-        ("text.txt", b"hello\n" * 100, "a picture or a text, not a video"),
-        ("picture.png", cv2.imencode(".png", draw(3))[1].tobytes(), "a picture or a text, not a video"),
+        ("text.txt", b"hello\n" * 100, "is a picture, a text file, or a video whose header lacks"),
+        ("picture.png", cv2.imencode(".png", draw(3))[1].tobytes(), "is a picture, a text file, or a video whose"),
     ],
 )
 def test_a_file_that_is_no_video_is_named(tmp_path, name, content, message):

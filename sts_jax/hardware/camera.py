@@ -113,9 +113,10 @@ class Camera:
 
     @property
     def is_connected(self) -> bool:
-        """True if the camera is open and can deliver frames.
+        """True if the camera is open and its background thread reads frames.
 
-        False before `connect`, while the camera is lost, and after an error or the end of a video file.
+        False before `connect`, after `disconnect`, while the camera is lost, after the end of a video file, and after
+        an error that ends the thread. The value stays True after a `FrozenCameraError` or a `FrameSizeError`.
         """
         return self._grabber is not None and self._grabber.running
 
@@ -184,8 +185,8 @@ class Camera:
         the oldest frame that has not been returned yet.
 
         Args:
-            timeout_ms: Longest wait (ms). None: `CameraConfig.timeout_s`. If the camera was lost before the call, the
-                camera must be found again within this time, too.
+            timeout_ms: Longest wait (ms). None: `CameraConfig.timeout_s`. If the camera was lost before the call, this
+                time includes the wait until the camera is found again.
 
         Returns:
             The frame.
@@ -244,7 +245,7 @@ class Camera:
                 raise problem
             raise StaleFrameError(
                 f"the newest frame of {self.config.name} is {age_ms:.0f} ms old, but at most {max_age_ms:g} ms are "
-                "allowed: check the device or its server, or raise max_age_ms."
+                "allowed: check the device or the stream's server, or raise max_age_ms."
             )
         return frame
 

@@ -72,7 +72,7 @@ class CameraConfig:
 
     @property
     def kind(self) -> Kind:
-        """The kind of the source: a device, a stream or a video file."""
+        """The kind of the source: "device", "stream" or "file" (a video file)."""
         if isinstance(self.target, int):
             return "device"
         if _URL.match(self.target):

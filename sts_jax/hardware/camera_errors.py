@@ -46,4 +46,4 @@ class StaleFrameError(CameraError):
 
 
 class EndOfVideoError(CameraError):
-    """All frames of the video file have been returned."""
+    """The video file or the recording has no more frames."""

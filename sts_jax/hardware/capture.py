@@ -75,7 +75,10 @@ class Capture:
                 if abs(rate - config.fps) > _RATE_TOLERANCE * config.fps:
                     warnings.append(f"FPS: asked for {config.fps:g}, found {rate:g}")
         if config.kind == "file" and (self.frame_count is None or self._fourcc() == _ANSI):
-            raise CameraOpenError(f"{config.name} is a picture or a text, not a video: give a video file.")
+            raise CameraOpenError(
+                f"{config.name} is a picture, a text file, or a video whose header lacks the number of frames: give a "
+                "video file whose header contains this number, such as a complete MP4 file."
+            )
         if config.kind == "stream" and self._fourcc() == _MJPG:
             self._jpeg = self.properties.set(cv2.CAP_PROP_FORMAT, -1)
         width, height = (round(self.properties.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
@@ -173,7 +176,14 @@ def size_error(config: CameraConfig, width: int, height: int) -> FrameSizeError:
 
 
 def check_source(config: CameraConfig) -> None:
-    """Raise a `CameraError` if a device or a file does not exist, is of the wrong kind, or is not accessible to you."""
+    """Check the device or the video file of a configuration before OpenCV opens it.
+
+    Streams are not checked. Devices are checked on Linux only.
+
+    Raises:
+        CameraError: The path does not exist or is a folder, the user lacks a permission, the device is not a camera, or
+            the file is empty.
+    """
     if config.kind == "stream" or (config.kind == "device" and sys.platform != "linux"):
         return
     path = Path(devices.device_path(config.target))
@@ -182,7 +192,7 @@ def check_source(config: CameraConfig) -> None:
         remedy = devices.cameras_found() if device else f"Check the path (the working directory is {Path.cwd()})."
         raise CameraNotFoundError(f"there is no {'device' if device else 'file'} {path}. {remedy}")
     if path.is_dir():
-        raise CameraOpenError(f"{path} is a folder: give a video file.")
+        raise CameraOpenError(f"{path} is a folder: give {'the path of a camera' if device else 'a video file'}.")
     if not os.access(path, os.R_OK | os.W_OK if device else os.R_OK):
         group = _group(path)
         remedy = f"add your user to the group {group} with `sudo usermod -aG {group} $USER`, then log in again"
@@ -206,7 +216,7 @@ def _group(path: Path) -> str:
 
 
 def opening_error(config: CameraConfig) -> CameraError:
-    """Return the error for an existing source that OpenCV could not open."""
+    """Return the error for a source that passed `check_source`, but that OpenCV could not open."""
     if config.kind == "stream":
         return _stream_error(config)
     if config.kind == "file":

@@ -1,7 +1,7 @@
 """`collect`: the loop that reads a sensor, instructs a person, and saves trajectories in the folder of a session.
 
-A trajectory consists of a pair of images of an object that a person holds on the pad, and a pair of images of the same
-object at rest after its release.
+A trajectory consists of two pairs of images. A pair is a visual and a tactile image. The first pair shows an object
+that a person holds on the pad. The second pair shows the same object at rest after its release.
 """
 
 import dataclasses
@@ -30,8 +30,8 @@ _PASSING = (
 class Action(enum.Enum):
     """An action of the person who collects trajectories with `collect`.
 
-    A trajectory consists of two pairs of images. The first pair shows a held object. The second pair shows the same
-    object after its release.
+    A trajectory consists of two pairs of images. A pair is a visual and a tactile image. The first pair shows a held
+    object. The second pair shows the same object after its release.
     """
 
     CONFIRM = "confirm"  # confirm the current stage: the pad is empty, the object is released, the trajectory is good
@@ -58,7 +58,7 @@ class View:
 
 @runtime_checkable
 class PairReader(Protocol):
-    """A sensor that returns pairs of images, such as `STS` or the digital twin's `VirtualSensor`."""
+    """A sensor that returns pairs of a visual and a tactile image, such as `STS` or the twin's `VirtualSensor`."""
 
     def read(self) -> Pair:
         """Return a new visual and a new tactile image. Both arrive after the beginning of the call."""
@@ -92,7 +92,7 @@ class AutomaticPerson:
         self._stage = Stage.CLEAR
 
     def show(self, view: View) -> None:
-        """Store `view.stage`, the current stage of the guide. The result of `action` depends on this stage."""
+        """Store `view.stage`, because the result of `action` depends on it."""
         self._stage = view.stage
 
     def action(self) -> Action | None:
@@ -117,10 +117,10 @@ def collect(
 ) -> int:
     """Collect trajectories until the person stops, or until the session has enough of them.
 
-    A trajectory consists of two pairs of images. The first pair shows an object that a person holds on the pad. The
-    second pair shows the same object at rest after its release. A state machine, the guide, evaluates the images.
-    The guide chooses the instruction for the person, and decides when each pair is saved. At the end of each
-    trajectory, the person confirms or discards it.
+    A trajectory consists of two pairs of images. A pair is a visual and a tactile image. The first pair shows an object
+    that a person holds on the pad. The second pair shows the same object at rest after its release. A state machine,
+    the guide, evaluates the images. The guide chooses the instruction for the person, and decides when each pair is
+    saved. At the end of each trajectory, the person confirms or discards it.
 
     Args:
         sensor: Connected sensor.

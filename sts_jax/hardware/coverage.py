@@ -54,10 +54,10 @@ def check_view(lens: Lens, pinhole: Pinhole, largest_angle: float | None = None)
     needed = view_angle(lens, pinhole)
     if largest_angle is not None and needed > largest_angle + _EXTRAPOLATION:
         raise CalibrationError(
-            f"the corners of the sensor's view are {math.degrees(needed):.1f} degrees from the optical axis, but the "
-            f"calibration images show the board only up to {math.degrees(largest_angle):.1f} degrees. The difference "
-            f"must be at most {math.degrees(_EXTRAPOLATION):.0f} degrees. Take more images with the board in the "
-            "corners of the image, and calibrate again."
+            f"the corners of the sensor's view are up to {math.degrees(needed):.1f} degrees from the optical axis, but "
+            f"the calibration images show the board only up to {math.degrees(largest_angle):.1f} degrees. The "
+            f"difference must be at most {math.degrees(_EXTRAPOLATION):.0f} degrees. Take more images with the board "
+            "in the corners of the image, and calibrate again."
         )
     try:
         pixels = rectification(lens, pinhole, _RESOLUTION)
@@ -69,7 +69,7 @@ def check_view(lens: Lens, pinhole: Pinhole, largest_angle: float | None = None)
         blocks = [b for rows in np.array_split(outside, 3) for b in np.array_split(rows, 3, axis=1)]
         parts = ", ".join(part for part, block in zip(PARTS, blocks, strict=True) if block.any())
         raise CalibrationError(
-            f"{outside.mean():.2%} of the sensor's view lies outside of the raw image ({parts}), but the raw image "
+            f"{outside.mean():.2%} of the sensor's view ({parts}) lies outside of the raw image, but the raw image "
             "must show the whole view. Mount the camera under the centre of the pad and parallel to the pad, or use a "
             "lens with a larger field of view."
         )

@@ -1,4 +1,4 @@
-"""The cameras of this machine: their list, the processes that use them, and one lock per camera."""
+"""Functions that list the cameras of this machine, find the processes that use a camera, and lock a camera."""
 
 import contextlib
 import dataclasses
@@ -22,7 +22,7 @@ _OWN = 0x80000000  # V4L2_CAP_DEVICE_CAPS: the third number describes this devic
 
 @dataclasses.dataclass(frozen=True)
 class FoundCamera:
-    """A camera of this machine."""
+    """A camera that `find_cameras` has found: its path, its name, and the processes that use it."""
 
     source: str  # most stable path of the camera, which `CameraConfig` accepts as its source
     device: str  # path that `source` points to, such as /dev/video0
@@ -84,7 +84,10 @@ def cameras_found() -> str:
 
 
 def users_of(device: Path) -> tuple[int, ...]:
-    """Return the ids of the processes that have opened a device. Empty on other systems than Linux."""
+    """Return the ids of the processes that have opened a device.
+
+    Processes of other users may be missing. On systems other than Linux, the result is empty.
+    """
     target, users = os.path.realpath(device), []
     for folder in Path("/proc").glob("[0-9]*/fd"):
         with contextlib.suppress(OSError):  # the process has ended, or another user runs it
@@ -95,9 +98,9 @@ def users_of(device: Path) -> tuple[int, ...]:
 
 @contextlib.contextmanager
 def locked(config: CameraConfig) -> Iterator[None]:
-    """Lock a camera against use by others while the context is active.
+    """Lock a camera while the context is active, so that no other `Camera` object can use it.
 
-    The camera is a device or a network stream. If the source of `config` is a video file, nothing is locked.
+    Devices and network streams are locked. If the source of `config` is a video file, nothing is locked.
 
     Args:
         config: Configuration of the camera.

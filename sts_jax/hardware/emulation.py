@@ -1,6 +1,7 @@
-"""A software emulation of the LED controller: it answers lines of the protocol, on a clock that the caller supplies.
+"""A software emulation of the LED controller. It answers protocol requests, and the caller passes the current time.
 
-The tests run the firmware in a simulator of the chip, and compare the firmware's answers with the emulated answers.
+The tests run the real controller's firmware in a simulator of its microcontroller, and compare the answers of the
+firmware with the answers of the emulation.
 """
 
 from sts_jax.hardware import protocol

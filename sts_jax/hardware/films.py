@@ -1,4 +1,4 @@
-"""`Film`: the recorded images of both streams, from a folder of `Recorder` or from two plain video files."""
+"""`Film`: recorded visual and tactile images, from a folder that `Recorder` wrote or from two video files."""
 
 import abc
 import json
@@ -127,8 +127,9 @@ class RecordedFilm(Film):
         there = sum(place.offset + place.size <= size for place in places)
         if there < len(places):
             raise DamagedFileError(
-                f"{path} is truncated: it has {there} images, but {FRAMES} lists {len(places)}. {_AGAIN.capitalize()}, "
-                f"or remove the last {len(places) - there} lines of the {stream} stream from {FRAMES}."
+                f"{path} is truncated: it has {there} of the {len(places)} images that {FRAMES} lists for the {stream} "
+                f"stream. {_AGAIN.capitalize()}, or remove the lines of the missing images from {FRAMES} (the last "
+                f"{len(places) - there} with stream {stream!r})."
             )
 
     def image(self, index: int) -> Image:
