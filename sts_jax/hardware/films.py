@@ -197,10 +197,11 @@ def _still(values: dict[str, Any]) -> Still:
 
 
 class VideoFilm(Film):
-    """The images of two video files, one for each stream. Frames with the same number have the same time.
+    """The images of two video files, one file for the visual stream and one for the tactile stream.
 
-    A video file does not record when the lights were switched. The times of the lights in each `Still` (`until_s`,
-    `before.sent_s` and `before.acknowledged_s`) are therefore NaN.
+    Frames with the same number have the same time. A video file does not record when the lights were switched.
+    In each `Still` (the description of an image), `until_s`, `before.sent_s` and `before.acknowledged_s` are therefore
+    NaN.
     """
 
     def __init__(self, visual: str | os.PathLike, tactile: str | os.PathLike, fps: float | None = None):

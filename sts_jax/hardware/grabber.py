@@ -86,7 +86,7 @@ class Grabber:
             if problem is not None:
                 raise problem()
             raise CameraTimeoutError(
-                f"{self._config.name} has sent no frame within {timeout_s:g} s: check the device or its server, or "
+                f"{self._config.name} has sent no frame within {timeout_s:g} s: check the device or the stream's server, or "
                 "raise timeout_s in CameraConfig."
             )
 
@@ -115,7 +115,7 @@ class Grabber:
             Descriptions of the settings that the driver did not accept.
 
         Raises:
-            CameraError: No frame has arrived in time.
+            CameraError: The camera has a problem, for example it was lost, or no frame has arrived in time.
         """
         with self._changed:
             self._settle = True
@@ -137,7 +137,7 @@ class Grabber:
             The exposure that the device has now, or None if the driver does not support a manual exposure.
 
         Raises:
-            CameraError: No frame has arrived in time.
+            CameraError: No frame has arrived in time, or the thread that fetches the frames has ended.
         """
         with self._changed:
             self._wanted = value
@@ -240,7 +240,7 @@ class Grabber:
             last = f"the last one arrived {time.monotonic() - self._newest.time_s:.2f} s ago"
         return CameraTimeoutError(
             f"{self._config.name} has sent no usable frame within {1000 * timeout_s:.0f} ms ({last}, "
-            f"{self._counts.damaged} damaged frames since connect): check the device or its server, or raise the "
+            f"{self._counts.damaged} damaged frames since connect): check the device or the stream's server, or raise the "
             "timeout (timeout_ms or timeout_s)."
         )
 

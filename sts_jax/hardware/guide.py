@@ -1,7 +1,8 @@
-"""The guide leads a person through the stages of a trajectory, and derives the current stage from images.
+"""The guide leads a person through the stages of recording a trajectory, and derives the current stage from images.
 
-The guide is a pure function of a state and a pair of images, and needs no devices. The person places an object on the
-pad and holds it (stages `PLACE` and `HOLD`), releases it (`RELEASE`), and waits until it rests (`STILL`).
+The guide is a pure function of a state and a pair of images (one visual, one tactile), and needs no devices. The person
+places an object on the pad and holds it (stages `PLACE` and `HOLD`), releases it (`RELEASE`), and waits until it rests
+(`STILL`).
 
 Each image is divided into 24 rows of 32 blocks. A movement is a change of a block's mean colour between two images. The
 noise of single pixels averages out in the mean colour. A contact is a difference between a mean colour and the mean

@@ -21,9 +21,9 @@ _LONGEST_WAIT_S = 5.0
 
 @dataclasses.dataclass(frozen=True)
 class Lit:
-    """The controller's answer to a request: the levels of the lights, and when they were applied.
+    """The controller's answer to a request: the levels of the lights, and the times of the request and the answer.
 
-    The levels were applied at some time between `sent_s` and `acknowledged_s`, both on the clock `time.monotonic`.
+    The lights had these levels at some time between `sent_s` and `acknowledged_s`, both on the clock `time.monotonic`.
     """
 
     levels: protocol.Levels  # duty cycles of the four light channels, 0 to 255
