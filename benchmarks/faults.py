@@ -149,7 +149,7 @@ class Bench:
         )
 
     def plug_in(self, name: str) -> None:
-        """Plug in the emulated controller. The controller's port is the symbolic link `name` in the folder."""
+        """Plug in the emulated controller, whose port is the symbolic link `name` in the folder of this bench."""
         self.peer.plug_in(self.folder / name)
         self.ports[:] = [_usb_port(str(self.folder / name))]
 

@@ -165,7 +165,7 @@ def median_seconds(call: Callable[[], None], repeats: int) -> float:
 
 
 def paper() -> None:
-    """Print the milliseconds of training steps and of a prediction of the paper's model."""
+    """Print how long training steps and a prediction take with the paper's model (ms)."""
     with mock.patch.multiple(networks, conv=plain_conv, conv_transpose=plain_conv_transpose):
         plain = stepper(MODEL, 64, ())
     ours, enumerated = np.median(in_turn(stepper(MODEL, 64, ("tactile",)), plain, repeats=3), axis=0)
@@ -178,7 +178,7 @@ def paper() -> None:
 
 
 def state_space() -> None:
-    """Print the milliseconds of a training step and of a prediction of the state-space model."""
+    """Print how long a training step and a prediction take with the state-space model (ms)."""
     print(f"state-space model, training step, batch 32: {1e3 * median_seconds(state_stepper(32), 11):.1f} ms")
     print(f"state-space model, prediction with 16 samples: {1e3 * median_seconds(state_predictor(16), 50):.1f} ms")
 

@@ -246,13 +246,13 @@ def test_parts_of_the_view_that_the_camera_does_not_see_are_black():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"width": 0}, "width must be a whole number >= 1, got 0"),
-        ({"height": 480.0}, "height must be a whole number"),
+        ({"width": 0}, "width must be an int >= 1, got 0"),
+        ({"height": 480.0}, "height must be an int"),
         ({"fx": -1.0}, r"fx must be > 0, got -1\.0"),
-        ({"cy": math.nan}, "cy must be a finite number, got nan"),
-        ({"k": (0.0, 0.0)}, "k must be a tuple of 4 finite numbers"),
-        ({"k": (0.0, math.inf, 0.0, 0.0)}, "k must be a tuple of 4 finite numbers"),
-        ({"rotation": (0.0, 0.0)}, "rotation must be a tuple of 3 finite numbers"),
+        ({"cy": math.nan}, "cy must be a finite int or float, got nan"),
+        ({"k": (0.0, 0.0)}, "k must be a tuple of 4 finite ints or floats"),
+        ({"k": (0.0, math.inf, 0.0, 0.0)}, "k must be a tuple of 4 finite ints or floats"),
+        ({"rotation": (0.0, 0.0)}, "rotation must be a tuple of 3 finite ints or floats"),
         ({"translation": (0.0, 0.0, -0.1)}, "the third number of translation must be > 0"),
         ({"rotation": (math.pi, 0.0, 0.0)}, r"place the camera at .* must lie inside the sensor, where z is negative"),
     ],
@@ -269,7 +269,7 @@ def test_invalid_arguments_raise_errors():
         ValueError, match="the image has 100x50 pixels, but the lens was calibrated with images of 640x480"
     ):
         hardware.rectified(IDEAL, PINHOLE, np.zeros((50, 100, 3), np.uint8), (48, 64))
-    with pytest.raises(ValueError, match="image must be uint8 of shape"):
+    with pytest.raises(ValueError, match="image must be a uint8 NumPy array of shape"):
         hardware.distorted(IDEAL, PINHOLE, np.zeros((2, 48, 64, 3), np.uint8), outside=0)
     with pytest.raises(ValueError, match="resolution must be"):
         hardware.rectified(IDEAL, PINHOLE, image, (0, 64))

@@ -86,8 +86,8 @@ class Grabber:
             if problem is not None:
                 raise problem()
             raise CameraTimeoutError(
-                f"{self._config.name} has sent no frame within {timeout_s:g} s: check the device or the stream's server, or "
-                "raise timeout_s in CameraConfig."
+                f"{self._config.name} has sent no frame within {timeout_s:g} s: check the device or the stream's "
+                "server, or raise timeout_s in CameraConfig."
             )
 
     def stop(self) -> bool:
@@ -240,8 +240,8 @@ class Grabber:
             last = f"the last one arrived {time.monotonic() - self._newest.time_s:.2f} s ago"
         return CameraTimeoutError(
             f"{self._config.name} has sent no usable frame within {1000 * timeout_s:.0f} ms ({last}, "
-            f"{self._counts.damaged} damaged frames since connect): check the device or the stream's server, or raise the "
-            "timeout (timeout_ms or timeout_s)."
+            f"{self._counts.damaged} damaged frames since connect): check the device or the stream's server, or raise "
+            "the timeout (timeout_ms or timeout_s)."
         )
 
     # The thread

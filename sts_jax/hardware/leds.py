@@ -156,8 +156,9 @@ class Leds:
             leds.close()
         found = ", ".join(f"{name} ({result})" for name, result in tried.items()) or "none"
         raise ports.PortNotFoundError(
-            f"LED controller {serial_number} was not found on any USB port. Connect it by USB, or give the name of its "
-            f"port. USB ports tried: {found}."
+            f"LED controller {serial_number} was not found on any USB port. Connect it by USB. If its port is not a "
+            "USB device, pass the name of the port to `Leds.connect`, or to `STS.from_file` as the argument `leds`. "
+            f"USB ports tried: {found}."
         )
 
     @property
@@ -231,8 +232,8 @@ class Leds:
             self.set(protocol.DARK)
         except ports.LedError as error:
             _log.warning(
-                "the lights on %s could not be turned off by a request, so the controller's watchdog will turn them "
-                "off: %s",
+                "the request to turn off the lights on %s failed. The controller's watchdog will turn them off. Cause "
+                "of the failure: %s",
                 self._port,
                 error,
             )

@@ -1,8 +1,8 @@
-"""The model of a real sensor's fisheye lens, and the conversion of its images to the simulated sensor's pinhole view.
+"""The model of a real sensor's fisheye lens, and the conversion between real images and simulated pinhole images.
 
 Pixel coordinates are (column, row). The coordinates of a pixel's centre are whole numbers. A *raw* image comes from the
-camera. A *rectified* image shows the view of the simulated sensor's pinhole camera. A raw pixel and a rectified pixel
-correspond if their rays meet the gel's outer face (z = 0 in the sensor frame) in the same point.
+real camera. A *rectified* image shows the view of the simulated pinhole camera. A raw pixel and a rectified pixel
+correspond if their rays meet the gel's outer face (z = 0 in the sensor frame) at the same point.
 """
 
 import dataclasses
@@ -73,15 +73,15 @@ class Lens:
         for name in ("width", "height"):
             value = getattr(self, name)
             if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-                raise ValueError(f"{name} must be a whole number >= 1, got {value!r}")
+                raise ValueError(f"{name} must be an int >= 1, got {value!r}")
         for name in ("fx", "fy", "cx", "cy"):
             value = getattr(self, name)
             if not _is_number(value):
-                raise ValueError(f"{name} must be a finite number, got {value!r}")
+                raise ValueError(f"{name} must be a finite int or float, got {value!r}")
         for name, length in (("k", 4), ("rotation", 3), ("translation", 3)):
             value = getattr(self, name)
             if not isinstance(value, tuple) or len(value) != length or not all(map(_is_number, value)):
-                raise ValueError(f"{name} must be a tuple of {length} finite numbers, got {value!r}")
+                raise ValueError(f"{name} must be a tuple of {length} finite ints or floats, got {value!r}")
         for name in ("fx", "fy"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"{name} must be > 0, got {getattr(self, name)}")
@@ -520,11 +520,13 @@ def _is_number(value: object) -> bool:
 def _checked(resolution: tuple[int, int]) -> tuple[int, int]:
     """The resolution as two integers, or a `ValueError`."""
     if len(resolution) != 2 or not all(isinstance(n, int | np.integer) and n >= 1 for n in resolution):
-        raise ValueError(f"resolution must be (height, width) in pixels, both >= 1, got {resolution!r}")
+        raise ValueError(f"resolution must be two integers >= 1 (height and width in pixels), got {resolution!r}")
     return int(resolution[0]), int(resolution[1])
 
 
 def _check_image(image: NDArray) -> None:
     if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.ndim not in (2, 3):
         found = f"{image.dtype} of shape {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
-        raise ValueError(f"image must be uint8 of shape (height, width) or (height, width, channels), got {found}")
+        raise ValueError(
+            f"image must be a uint8 NumPy array of shape (height, width) or (height, width, channels), got {found}"
+        )

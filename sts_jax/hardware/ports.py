@@ -32,7 +32,7 @@ class PortInUseError(LedError):
 
 
 class NotALedControllerError(LedError):
-    """Raised if a port is not serial or its device does not answer as an LED controller. The message has details."""
+    """Raised if a device is not a serial port, or does not answer the requests as an LED controller does."""
 
 
 class WrongVersionError(LedError):

@@ -75,9 +75,9 @@ class Hand(AutomaticPerson):
         if self._now_s - self._since_s > self._patience_s or self._unseen == _UNSEEN:
             raise ValueError(
                 f"hardware.collect has shown the instruction `{view.instruction}` for "
-                f"{self._now_s - self._since_s:.1f} s (contact: {view.contact}, still: {view.still}, held poses in a "
-                f"row without contact: {self._unseen}, limit: {_UNSEEN}): the thresholds of hardware.collect do not "
-                f"suit the twin's images, or patience_s of Hand ({self._patience_s:g} s) is too short. Change the "
+                f"{self._now_s - self._since_s:.1f} s (contact: {view.contact}, still: {view.still}). Number of "
+                f"successive held poses that showed no contact: {self._unseen}. The thresholds of hardware.collect do "
+                f"not suit the twin's images, or patience_s of Hand ({self._patience_s:g} s) is too short. Change the "
                 "argument config (a GuideConfig) of hardware.collect, or increase patience_s"
             )
 
