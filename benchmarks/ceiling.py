@@ -9,7 +9,7 @@ values of the hidden properties, such as friction and mass. The command uses the
 scenario's experiment. The command prints the errors of three predictions:
 
 - the mean of the re-rolls, which is the best prediction from shape, pose and condition (such as the jerk of the pad)
-- a single re-roll, which is as sharp as a true image
+- the last frame of a single re-roll. Its image is as sharp as a true image
 - the baselines
 
 Below the tables, the command prints how far the final poses of one start lie apart. Without `--workdir`, the dataset is

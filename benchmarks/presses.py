@@ -72,7 +72,7 @@ class Pixels:
 
 
 class Descent(NamedTuple):
-    """Unknowns of `shader` and state of the Adam optimiser, between two steps of `refine`."""
+    """The values that `refine` optimises, and the state of the Adam optimiser, between two steps."""
 
     unknowns: dict[str, Array]
     optimiser: optax.OptState

@@ -64,8 +64,8 @@ class Config(sense.Config):
 class Slope(NamedTuple):
     """The loss of an image, with the gradient and the Gauss-Newton matrix with respect to (x, y, yaw).
 
-    r is the vector of the n pixel values of the blurred difference between the image and the target. The matrix
-    J = dr / d(x, y, yaw) has the shape (n, 3).
+    r is the vector of the n pixel values of the blurred difference between the image and the target, and J is its
+    Jacobian `dr / d(x, y, yaw)`, of shape (n, 3). The fields are computed from r and J.
     """
 
     image: jax.Array  # tactile image, shape (h, w, 3)

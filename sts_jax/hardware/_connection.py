@@ -1,4 +1,4 @@
-"""An open port to the LED controller: sends requests, repeats them, and finds the answer to each."""
+"""`Connection`: a serial connection to the LED controller that repeats each request until its answer arrives."""
 
 import logging
 import random
@@ -192,8 +192,8 @@ class Connection:
     def _wrong_version(self, found: str) -> ports.WrongVersionError:
         return ports.WrongVersionError(
             f"the LED controller on {self.name} uses another version of the protocol ({found}), but this version of "
-            f"sts_jax needs version {protocol.VERSION}. Flash its firmware: `make flash PORT={self.name}` in "
-            "sts_jax/hardware/firmware."
+            f"sts_jax needs version {protocol.VERSION}. Flash the firmware of this version of sts_jax: run `make flash "
+            f"PORT={self.name}` in sts_jax/hardware/firmware."
         )
 
     def _description(self) -> str:

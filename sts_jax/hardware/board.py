@@ -1,4 +1,4 @@
-"""The printed ChArUco board that calibrates a lens: its dimensions, the page to print, and its corners in images."""
+"""ChArUco board for the calibration of a lens: dimensions of the board, page to print, and detection in images."""
 
 import dataclasses
 import os
@@ -149,8 +149,8 @@ def save_board(
         outline: Width and height of the frame around the board (m), usually the size of the sensor's gel pad.
 
     Raises:
-        ValueError: The path has another ending, the board does not fit into the frame, or the frame does not fit on the
-            page.
+        ValueError: The path does not end in .pdf or .png, the board does not fit into the frame, or the frame does not
+            fit on the page.
         OSError: The file cannot be written.
     """
     path = Path(path)

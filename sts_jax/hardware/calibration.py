@@ -67,13 +67,15 @@ def calibrate(
         largest_error: Largest allowed root mean square of the reprojection errors of an image (pixels).
 
     Returns:
-        The lens with the camera's pose relative to the pad, and the reprojection error of each image.
+        The lens with the camera's pose relative to the pad, and the root mean square of the reprojection errors of each
+        image.
 
     Raises:
-        CalibrationError: Too few images show the board. Or, in the image with the index `on_pad`, the board is not
-            found, or the plane of the board is tilted by more than 30 degrees against the image plane, or the edges of
-            the board are rotated by more than 30 degrees against the edges of the image. Or the board has nearly the
-            same tilt in all images. Or the reprojection error of an image is larger than `largest_error`.
+        CalibrationError: Too few images show at least 12 corners of the board, the board has nearly the same tilt in
+            all images, or the reprojection errors of an image exceed `largest_error`. This error is also raised if, in
+            the image with the index `on_pad`, fewer than 12 corners are found, the plane of the board is tilted against
+            the image plane by more than 30 degrees, or the edges of the board are rotated against the edges of the
+            image by more than 30 degrees.
         ValueError: The images have different sizes or are not uint8, or `on_pad` is not the index of an image.
     """
     height, width = _common_size(images)
@@ -99,13 +101,15 @@ def fit_lens(
         largest_error: Largest allowed root mean square of the reprojection errors of an image (pixels).
 
     Returns:
-        The lens with the camera's pose relative to the pad, and the reprojection error of each image.
+        The lens with the camera's pose relative to the pad, and the root mean square of the reprojection errors of each
+        image.
 
     Raises:
-        CalibrationError: Too few images show the board. Or, in the image with the index `on_pad`, the board is not
-            found, or the plane of the board is tilted by more than 30 degrees against the image plane, or the edges of
-            the board are rotated by more than 30 degrees against the edges of the image. Or the board has nearly the
-            same tilt in all images. Or the reprojection error of an image is larger than `largest_error`.
+        CalibrationError: Too few images show at least 12 corners of the board, the board has nearly the same tilt in
+            all images, or the reprojection errors of an image exceed `largest_error`. This error is also raised if, in
+            the image with the index `on_pad`, fewer than 12 corners are found, the plane of the board is tilted against
+            the image plane by more than 30 degrees, or the edges of the board are rotated against the edges of the
+            image by more than 30 degrees.
         ValueError: `on_pad` is not the index of an image.
     """
     width, height = size
@@ -266,8 +270,8 @@ def _usable(counts: tuple[int, ...], on_pad: int) -> list[int]:
     )
     if on_pad not in used:
         raise CalibrationError(
-            f"image {on_pad}, in which the board lies on the pad, shows {counts[on_pad]} corners of the board, but at "
-            f"least {FEWEST_CORNERS} are needed.{lacking}{remedy}"
+            f"on_pad is {on_pad}, so image {on_pad} must show at least {FEWEST_CORNERS} corners of the board, but it "
+            f"shows {counts[on_pad]}.{lacking}{remedy}"
         )
     if len(used) < FEWEST_IMAGES:
         raise CalibrationError(
@@ -282,10 +286,10 @@ def _check_errors(errors: list[float | None], largest: float) -> None:
     bad = [f"{i} ({error:.2f} pixels)" for i, error in enumerate(errors) if error is not None and error > largest]
     if bad:
         raise CalibrationError(
-            f"the reprojection error is larger than {largest:g} pixels in {_listed(bad)}. If only a few images are "
-            "listed, leave them out: they may be blurred, or the board may have moved. If most images are listed, "
-            "check that the board is flat, that its squares have the size `Board.square`, and that focus and image "
-            "size were the same for all images."
+            f"largest_error is {largest:g} (pixels), but the root mean square of the reprojection errors is larger in "
+            f"{_listed(bad)}. If only a few images are listed, leave them out: they may be blurred, or the board may "
+            "have moved. If most images are listed, check that the board is flat, that its squares have the size "
+            "`Board.square`, and that focus and image size were the same for all images."
         )
 
 
@@ -297,8 +301,8 @@ def _check_tilts(poses: NDArray[np.float64]) -> None:
         raise CalibrationError(
             "the largest difference between the tilts of the board in any two images is "
             f"{math.degrees(spread):.0f} degrees, but at least {math.degrees(LEAST_TILT):.0f} degrees are needed to "
-            "compute the focal length. Hold the board with tilts of 20 to 40 degrees in some images, each time towards "
-            "another side."
+            "compute the focal length. Tilt the board by 20 to 40 degrees in some images, each time in a different "
+            "direction."
         )
 
 

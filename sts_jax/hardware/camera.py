@@ -1,4 +1,4 @@
-"""`Camera`: reads frames from a V4L2 device, a stream or a video file, each with the time of its arrival."""
+"""`Camera`: reads frames and the times of their arrival from a V4L2 device, a network stream or a video file."""
 
 import dataclasses
 import time
@@ -19,7 +19,7 @@ from sts_jax.hardware.grabber import Grabber
 
 
 class Camera:
-    """A V4L2 device, a network stream or a video file whose frames are read.
+    """A camera that reads frames from a V4L2 device, a network stream or a video file.
 
     ```python
     with Camera(CameraConfig("/dev/v4l/by-id/usb-Maker_Camera_0123-video-index0")) as camera:
@@ -43,7 +43,7 @@ class Camera:
         self._grabber: Grabber | None = None
 
     def connect(self, warmup_s: float = 1.0) -> "Camera":
-        """Open the camera, and wait until its automatic exposure and white balance have settled.
+        """Open the camera, and wait `warmup_s` for its automatic exposure and white balance to settle.
 
         If the source is a V4L2 device and `CameraConfig.lock` is True, the call then locks the settings: it turns off
         the automatic control of exposure, white balance and focus, and discards all earlier frames. A video file starts
