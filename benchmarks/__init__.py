@@ -1,4 +1,4 @@
 """Commands that measure speed, endurance, accuracy, and the information in tactile data.
 
-`--help` describes each command.
+`python -m benchmarks.NAME --help` describes the command NAME.
 """

@@ -65,7 +65,7 @@ class Args:
 
 
 class Measured(NamedTuple):
-    """The results at one lag."""
+    """Results of the pairs that were read at one lag of the emulated camera."""
 
     lag_ms: float
     settling: hardware.Settling  # as `hardware.STS` measured it

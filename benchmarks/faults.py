@@ -60,7 +60,7 @@ class Args:
     """Options of the command line.
 
     Raises:
-        ValueError: `number` or `long` is out of range, or a kind is unknown.
+        ValueError: `number` or `long` is out of range, or `only` contains an unknown kind of fault.
     """
 
     number: int = 312  # number of faults
@@ -75,7 +75,7 @@ class Args:
         if self.number < 1:
             raise ValueError(f"--number must be at least 1, got {self.number}")
         if not 0 <= self.long <= 1:
-            raise ValueError(f"--long is a share of the faults and must be in [0, 1], got {self.long}")
+            raise ValueError(f"--long is the share of long faults and must be in [0, 1], got {self.long}")
         if unknown := set(self.only) - set(KINDS) - {KILLED}:
             raise ValueError(
                 f"--only has unknown kinds {sorted(unknown)}, but each kind must be one of: "
@@ -111,7 +111,7 @@ class Count:
 
 
 class Bench:
-    """The emulated devices, and the sensor that reads them.
+    """The emulated camera and LED controller, and the `hardware.STS` that uses them.
 
     Args:
         folder: Folder for the links to the controller's ports.
@@ -128,7 +128,7 @@ class Bench:
 
     @contextlib.contextmanager
     def connected(self) -> Iterator[hardware.STS]:
-        """Connect a sensor, which measures how long its lights take to settle, and disconnect the sensor at the end."""
+        """Connect a sensor, measure its settling times, and disconnect the sensor at the end of the `with` block."""
         with unittest.mock.patch("serial.tools.list_ports.comports", side_effect=lambda: self.ports):
             leds = hardware.Leds.connect(
                 self.peer.path, timeout_s=HANDSHAKE_S, answer_s=ANSWER_S, watchdog_ms=WATCHDOG_MS
@@ -285,7 +285,7 @@ RECONNECTING = (
 
 
 def inject(bench: Bench, sensor: hardware.STS, kind: str, count: Count) -> None:
-    """Inject one fault, read pairs until the fault is over, and go on reading until a pair arrives.
+    """Inject one fault, read pairs of images until the fault is over, and go on reading until a pair arrives.
 
     Args:
         bench: The emulated devices.
@@ -340,7 +340,9 @@ def _read(bench: Bench, sensor: hardware.STS, count: Count) -> bool:
 
 
 def host(path: str, url: str, width: int, height: int) -> None:
-    """Read pairs without end, in a second process. The function `kill` starts and kills the second process.
+    """Read pairs of images without end.
+
+    The function `kill` runs `host` in a second process, and kills the second process.
 
     Args:
         path: Port of the controller.
@@ -357,7 +359,7 @@ def host(path: str, url: str, width: int, height: int) -> None:
 
 
 def kill(bench: Bench, count: Count) -> None:
-    """Start a program that reads pairs, and kill it at a random moment while a light is on."""
+    """Start a program that reads pairs of images, and kill the program at a random moment while a light is on."""
     count.injected += 1
     count.limit_s = WATCHDOG_MS / 1000 + DARK_S
     size = bench.peer.camera.size

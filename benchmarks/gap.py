@@ -6,15 +6,15 @@
 No hardware is needed. The digital twin with its default imperfections (noise, vignetting, leaking light, JPEG, fisheye
 lens) takes the place of the real sensor. A second twin with almost no imperfections is the simulation ("clean"). Both
 twins run on a virtual clock with equal seeds, and the benchmark stops if their logs show different poses. The benchmark
-records two sessions, `WORKDIR/device` with its sensor file `WORKDIR/sensor.json`, and `WORKDIR/clean`.
-`experiments.gap` compares the two sessions:
+records two sessions, `WORKDIR/device` with its sensor file `WORKDIR/sensor.json`, and `WORKDIR/clean`. After
+the benchmark, run this command to compare the two sessions (with the default `WORKDIR`):
 
     python -m experiments.gap --real runs/gap-twin/device --sensor runs/gap-twin --simulated runs/gap-twin/clean
 
-The first two rows of the table compare images that differ by chance only: the two halves of the clean session, and two
-draws of the twin's noise. Each further row compares the images of the clean session with the same images after a known
-change: one added imperfection or, in the last row, all default imperfections. The distances are the mean absolute error
-of the pixels, the energy distance of image features, and the accuracy of a classifier.
+The first two rows of the benchmark's table compare images that differ by chance only: the two halves of the clean
+session, and two draws of the twin's noise. Each further row compares the images of the clean session with the same
+images after a known change: one added imperfection or, in the last row, all default imperfections. The distances are
+the mean absolute error of the pixels, the energy distance of image features, and the accuracy of a classifier.
 """
 
 import contextlib

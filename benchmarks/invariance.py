@@ -12,7 +12,7 @@ ways, which are called sides:
 - "ours": `simulate` with MJX
 - the same with half the time step
 - the same with start, jerk and object mirrored
-- `simulate` with C MuJoCo, also with half the time step and mirrored
+- the three sides above with C MuJoCo, instead of MJX, as the engine of `simulate`
 - "C MuJoCo": C MuJoCo with a plain model. The contacts are those that C MuJoCo finds for the mesh
 - "C, every vertex": C MuJoCo with a contact sphere at every vertex of the hull. The contacts that C MuJoCo finds for
   the mesh act only where a rim of the pad presses against the hull between the vertices

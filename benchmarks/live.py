@@ -107,10 +107,10 @@ def skill(found: np.ndarray, truth: np.ndarray) -> float:
 
 
 def main(args: Args) -> None:
-    """Record the trajectories, and print the skill of every model for two kinds of images.
+    """Record the trajectories, and print a table with the skill of every model.
 
-    In the first rows, the images keep the background, such as the twin's vignetting. In the other rows, the images are
-    divided by the images of the empty pad (`hardware.relit`).
+    In the rows with `kept`, the images contain the background of the twin, such as its vignetting. In the rows with
+    `divided out`, this background is replaced by the background of the model's training images (`hardware.relit`).
     """
     empty, held, rest = collect(args)
     pinhole, (height, width) = sts.Sensor().camera, empty[0].shape[:2]

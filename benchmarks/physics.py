@@ -13,14 +13,15 @@ All commands print their results. Only `--scaling` writes files.
   then one object of each of the eight classes, with hulls of up to 64 vertices.
 - `--engines N` measures falls per second of both engines of `simulate` (MJX and C MuJoCo), for N falls of each of 16
   objects. MJX simulates `--chunk` falls at once, and needs a larger `--chunk` on a GPU than on a CPU.
-- `--pipeline N` drops a bottle N times, renders every frame in both streams as 64x64 uint8 images, and fetches the
-  images from the device. The command prints seconds and frames per second of the physics, of the rendering, and of
+- `--pipeline N` drops a bottle N times, renders a visual and a tactile image of every frame (64x64, uint8), and fetches
+  the images from the device. The command prints seconds and frames per second of the physics, of the rendering, and of
   physics and rendering together. A frame is the state of one drop at one time. The engine of the physics is C MuJoCo on
   a machine without a GPU, and MJX on a GPU.
 - `--scaling` measures steps per second of 1 to 4,096 worlds at once (up to 65,536 on a GPU).
-- `--compile` measures the seconds before the first step of each scenario, and counts the compilations for a hundred
-  objects. For each scenario, the command starts two new processes. The first process starts with an empty compilation
-  cache. The second process starts with the compilation cache that the first process left.
+- `--compile` measures the seconds of compilation before the first step, for each scenario (`freefall`, `perturbed` and
+  `inclined`), and counts the compilations for a hundred objects. For each scenario, the command starts two new
+  processes. The first process starts with an empty compilation cache. The second process starts with the compilation
+  cache that the first process left.
 
 `--engines` and `--pipeline` include all costs except compilation.
 """

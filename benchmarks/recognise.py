@@ -48,8 +48,8 @@ def main(args: Args) -> str:
     rows = data.members("test")[args.first : args.first + NUMBER]
     if len(rows) < NUMBER:
         raise ValueError(
-            f"--first is {args.first}, but the held-out list has only {len(rows)} trajectories from index "
-            f"{args.first} on, and {NUMBER} are needed: give a smaller --first or a run with more held-out trajectories"
+            f"the held-out list must have at least {NUMBER} trajectories from index --first {args.first} on, got "
+            f"{len(rows)}: give a smaller --first or a run with more held-out trajectories"
         )
     pairs = data.pairs(rows)
     predictor = sts.Predictor.load(args.workdir / "models" / "statespace")

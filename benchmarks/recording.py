@@ -49,7 +49,7 @@ def pair(random: np.random.Generator, width: int, height: int, noise: float) -> 
 
 
 def main(args: Args) -> None:
-    """Write pairs of the two image sizes in SIZES, without and with noise, and print a table."""
+    """Write image pairs of each size in SIZES, without and with noise, and print the durations and file sizes."""
     random = np.random.default_rng(args.seed)
     print("size         noise   MB a pair   ms to encode   ms to write   longest of both")
     for width, height in SIZES:

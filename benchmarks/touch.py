@@ -29,8 +29,9 @@ class Args:
 def features(tactile: np.ndarray, blank: np.ndarray) -> np.ndarray:
     """Compute features of the imprint in each image: its summed and largest darkness, and its number of pixels.
 
-    The darkness of a pixel is -log(value / value in `blank`). The sums and the number of pixels enter as logarithms,
-    together with the squares and one product of these logarithms.
+    The darkness of a pixel is -log(value / value in `blank`), either its largest or its mean value over the channels.
+    The features are the largest darknesses, the logarithms of the sums of the darkness and of the number of pixels, the
+    squares of these logarithms, and the product of two of them.
 
     Args:
         tactile: Tactile images, uint8 `(n, h, w, 3)`.

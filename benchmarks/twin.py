@@ -61,9 +61,10 @@ def timed(call: Callable[[], object], number: int) -> float:
 
 
 def held(size: tuple[int, int], exposure_s: float) -> tuple[twin.Twin, twin.ObjectScene]:
-    """Make a twin whose lens has a field of view of 160 degrees, and a scene with an object of the class "camera".
+    """Make a digital twin and its scene, with one object of the class "camera".
 
-    The pad is empty until the twin receives the command `hold`, which places the object on the pad.
+    The lens of the twin has a field of view of 160 degrees. The pad is empty until the twin receives the command
+    `hold`, which places the object on the pad.
 
     Args:
         size: Height and width of the frames (pixels).

@@ -59,7 +59,7 @@ class Config:
 
     @property
     def board(self) -> hardware.Board:
-        """The board with the sizes on the printed page, computed from the measured length `ruler`."""
+        """Calibration board with its printed sizes, which are the nominal sizes times `ruler` / 100 mm."""
         scale, nominal = self.ruler / 100, hardware.Board()
         return dataclasses.replace(nominal, square=scale * nominal.square, marker=scale * nominal.marker)
 
@@ -199,8 +199,9 @@ def fit(pictures: boards.Pictures, pinhole: hardware.Pinhole) -> hardware.Lens:
     """Calibrate the lens from pictures of the board, and print the error of each picture.
 
     Raises:
-        CalibrationError: The pictures do not determine the lens, or the lens or the pictures do not cover the view of
-            the sensor. The view is the part of the gel's outer face that rectified images show.
+        CalibrationError: The pictures do not determine the lens or do not cover the view of the sensor, or the raw
+            image does not contain the whole view. The view is the part of the gel's outer face that rectified images
+            show.
     """
     say(f"board: {len(pictures.names)} pictures in {pictures.folder}, {pictures.describe()}")
     calibration = pictures.fit(pinhole)

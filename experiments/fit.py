@@ -9,8 +9,9 @@ x, y and yaw ten times. Each fit starts 3 mm and 10 degrees away from the true p
 
 The command prints one line for each fit. After the last fit, the command prints the number of fits that ended within
 0.2 mm and 1 degree of the true pose. This number is ten for scissors, fork and mouse, and eight for scissors with
-`--seed 1`. The picture shows the target, the images at the start and at the end of the first fit, and the path of every
-fit. To fit your own image, call `descend` with a function that calls `slope` with your image as `target`.
+`--seed 1`. The command writes a picture to `--out`. The picture shows the target, the images at the start and at the
+end of the first fit, and the path of every fit. To fit your own image, call `descend` with a function that calls
+`slope` with your image as `target`.
 """
 
 import dataclasses

@@ -68,7 +68,7 @@ class MotionJpeg:
     Args:
         fps: Frames per second.
         colour: BGR colour of all frames, except for a corner that alternates between two greys. None: the frames show
-            their numbers.
+            their numbers. If a colour is set, the modes `black`, `small` and `damaged` have no effect.
         size: Width and height of the frames (pixels).
     """
 

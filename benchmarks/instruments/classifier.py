@@ -70,7 +70,7 @@ def gain(before: np.ndarray, after: np.ndarray, weight: np.ndarray) -> float:
 
 
 def kept(before: np.ndarray, after: np.ndarray, other: np.ndarray, weight: np.ndarray) -> float:
-    """Gain from `before` to `other`, divided by the gain from `before` to `after`.
+    """The `gain` from `before` to `other`, divided by the `gain` from `before` to `after`.
 
     The arrays `before`, `after` and `other` are losses, `(n,)` each.
     """

@@ -104,7 +104,7 @@ def tipping(rigid: np.ndarray, base: np.ndarray, push: np.ndarray, time: np.ndar
 def shaken(
     scenario: physics.Perturbed, items: list[objects.Body], starts: Starts, touch: np.ndarray | None
 ) -> np.ndarray:
-    """Compute features from which a classifier predicts the outcomes of starts on the jerked pad.
+    """Compute features from which a classifier predicts the outcomes of trajectories on the jerked pad.
 
     The objects must be solids of revolution, such as bottles.
 

@@ -50,7 +50,7 @@ class Peer:
         """Make the port and begin to answer requests.
 
         Args:
-            path: Symbolic link to the port, which is created or replaced.
+            path: Path at which a symbolic link to the port is created or replaced.
             serial_number: Serial number of the controller.
             talk: Bytes that are sent repeatedly, with or without a request, as if the port belonged to another device.
                 None: the controller answers requests.

@@ -1,7 +1,8 @@
 """An emulated sensor: an LED controller on a pseudo-terminal, and a camera that sees the controller's lights.
 
-The grey value of a frame is the mean light of its exposure. A corner of the frame shows the frame's number. The camera
-logs the light by frame number, so a benchmark can check the light of an image independently of `hardware.STS`.
+The grey value of a frame increases linearly with the mean light during its exposure. A corner of the frame shows the
+frame's number. The camera logs the light by frame number, so a benchmark can check the light of an image independently
+of `hardware.STS`.
 """
 
 import dataclasses
@@ -146,7 +147,7 @@ class SensorPeer:
     """An emulated camera at the address `url`, and an emulated controller at the port `path`.
 
     Args:
-        path: Symbolic link to the controller's port, which is created.
+        path: Path at which a symbolic link to the controller's port is created.
         fps: Frames per second of the camera.
         lag_s: Time from the end of an exposure to the sending of the frame (s).
         exposure_s: Exposure time (s).
@@ -201,7 +202,7 @@ class SensorPeer:
         self.leds.vanish()
 
     def shown(self) -> dict[int, Shown]:
-        """Return the light of each frame by the frame's number, which `key` reads from an image."""
+        """Return the number and the mean light of each frame. The keys are the numbers that `key` reads from images."""
         return {number: Shown(number, exposure.mean) for number, exposure in self.camera.log.items()}
 
 

@@ -51,8 +51,9 @@ def margins(corners: np.ndarray, place: np.ndarray) -> list[float]:
         place: The point (m), `(2,)`.
 
     Returns:
-        Distance from the nearest edge (m). For the nearest edge that faces downhill (+y): distance (m), length (m),
-        and y component of the outward unit normal. Distances are positive inside of the polygon.
+        Four numbers. The first is the distance from the nearest edge (m). The others are the distance (m), the length
+        (m) and the y component of the outward unit normal of the nearest edge that faces downhill (+y), or of the
+        nearest edge if none faces downhill. Distances are positive inside of the polygon and negative outside.
     """
     along = np.roll(corners, -1, 0) - corners
     length = np.linalg.norm(along, axis=1) + 1e-9
@@ -72,13 +73,13 @@ def balance(
 
     Args:
         corners: Corners of the support polygon (m), `(k, 2)`.
-        centre: Centres of mass (m), `(m, 3)`, with z above the pad.
-        friction: Coefficients of friction, `(m,)`.
+        centre: Centres of mass (m), `(n, 3)`, with z above the pad.
+        friction: Coefficients of friction, `(n,)`.
         slope: Angle of the slope (rad).
 
     Returns:
-        The motion, `(m,)`, which is 0 for tipping, 1 for sliding and 2 for sticking, and the centre of pressure (m),
-        `(m, 2)`. A body that tips presses on the edge over which it tips.
+        The motion, `(n,)`, which is 0 for tipping, 1 for sliding and 2 for sticking, and the centre of pressure (m),
+        `(n, 2)`. A body that tips presses on the edge over which it tips.
     """
     grip = np.minimum(friction, math.tan(slope))
     pressure = centre[:, :2] + (centre[:, 2] * grip)[:, None] * np.array([0.0, 1.0])
@@ -127,7 +128,7 @@ def pressed(starts: Starts) -> np.ndarray:
 
 
 def laid(scenario: physics.Inclined, items: list[objects.Body], starts: Starts, touch: np.ndarray | None) -> np.ndarray:
-    """Compute features from which a classifier predicts the outcomes of starts on the slope.
+    """Compute features from which a classifier predicts the outcomes of trajectories on the slope.
 
     The objects may have any shape. The features include the probabilities of tipping, sliding and sticking. A
     probability is the weighted share of the predictions of `balance` for `DRAWS` random draws of the hidden contents,
@@ -139,7 +140,7 @@ def laid(scenario: physics.Inclined, items: list[objects.Body], starts: Starts, 
     Args:
         scenario: The scenario.
         items: The objects.
-        starts: Their starts, one row each.
+        starts: Starts of the trajectories, one row each.
         touch: Measured centre of pressure (m), `(n, 2)`, nan without contact. None: return features from vision alone.
 
     Returns:

@@ -89,15 +89,15 @@ def roll(
     again: int = 0,
     reroll: tuple[str, ...] = (),
 ) -> Starts:
-    """Simulate starts of each object, and some of these starts a second time with other hidden properties.
+    """Simulate trajectories of each object, and repeat some of them with other hidden properties.
 
     Args:
         key: Random key.
         items: The objects.
         scenario: The scenario.
-        num: Number of starts of each object.
-        again: Number of starts of each object that are simulated a second time.
-        reroll: Fields of `physics.Hidden` that are drawn again for the second simulation.
+        num: Number of trajectories of each object.
+        again: Number of trajectories of each object that are repeated from the same start.
+        reroll: Fields of `physics.Hidden` that are drawn again for the repetitions.
     """
     key, fresh = jax.random.split(key)
     with tqdm(total=len(items) * num, unit="starts") as bar:
@@ -129,11 +129,11 @@ def roll(
 
 
 def draw(items: list[objects.Body], starts: Starts) -> tuple[np.ndarray, np.ndarray]:
-    """Render the first frames of starts.
+    """Render the first frame of each trajectory.
 
     Args:
         items: The objects.
-        starts: Their starts, which must be sorted by object.
+        starts: Starts of the trajectories, sorted by object.
 
     Returns:
         Visual and tactile images, uint8 `(n, 64, 64, 3)` each.

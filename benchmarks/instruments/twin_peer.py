@@ -31,7 +31,7 @@ class TwinPeer:
         """Render the first images, and start the camera and the controller.
 
         Args:
-            path: Symbolic link to the controller's port, which is created.
+            path: Path at which a symbolic link to the controller's port is created.
             fps: Frames per second of the camera.
             lag_s: Time from the end of an exposure to the sending of the frame (s).
             exposure_s: Exposure time (s).
@@ -67,7 +67,7 @@ class TwinPeer:
         self.twin.close()
 
     def shown(self) -> dict[int, Shown]:
-        """Return the light of each frame by the frame's checksum, which `key` computes from an image."""
+        """Return the number and the mean light of each frame. The keys of the dict are checksums computed by `key`."""
         _, *parts = self._record.read_bytes().split(_START)
         frames = zip(parts, twin.read_log(self._log), strict=True)
         return {key(photometry.decode(_START + part)): Shown(frame.index, frame.light) for part, frame in frames}
