@@ -12,16 +12,16 @@ press is held out. An image is modelled by
 where `pressed` and `flat` are the normals and points of the pressed and of the flat skin. The image of the flat skin is
 thus the background, and the change is proportional to the brightness of the background. All images contain the pixel
 values of the camera divided by 255. Non-negative least squares selects lights from candidates in rings around the
-image. Gradient descent then fits the positions and colours of the lights, the fall-off, the specular
-reflectance and the shininess. The fitted lights explain the images, and need not be at the places of the sensor's LEDs.
-A few fitted lights lie under the part of the gel that the image shows.
+image. Gradient descent then fits the positions and colours of the lights, the fall-off, the specular reflectance and
+the shininess. The fitted lights explain the images, and need not be at the places of the sensor's LEDs. A few fitted
+lights lie under the part of the gel that the image shows.
 
 The command prints the peak signal-to-noise ratio of the background alone, of a fit with far lights, and of a fit with
 near lights. Each ratio is computed over the pixels of all held-out presses within 0.92 times the radius of the contact.
-For the fits, the command also prints the ratio over the pixels that were fitted.
-`presses.png` has a column for each held-out press: the real image, our image, and four times their difference on grey.
-Outside of the contact the shape of the skin is unknown, and our image is the background. Candidates, number of steps
-and learning rate were chosen on the 36 presses alone.
+For the fits, the command also prints the ratio over the pixels that were fitted. `presses.png` has a column for each
+held-out press: the real image, our image, and four times their difference on grey. Outside of the contact the shape of
+the skin is unknown, and our image is the background. Candidates, number of steps and learning rate were chosen on the
+36 presses alone.
 """
 
 import dataclasses

@@ -48,7 +48,7 @@ def main(args: Args) -> str:
     rows = data.members("test")[args.first : args.first + NUMBER]
     if len(rows) < NUMBER:
         raise ValueError(
-            f"the held-out list must have at least {NUMBER} trajectories from index --first {args.first} on, got "
+            f"the held-out list must have at least {NUMBER} trajectories from index {args.first} (--first) on, got "
             f"{len(rows)}: give a smaller --first or a run with more held-out trajectories"
         )
     pairs = data.pairs(rows)

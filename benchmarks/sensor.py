@@ -17,11 +17,14 @@ of the same faces and poses, in three ways:
 
 All calls are timed in one thread, and also in as many threads as there are cores. One call of `sense` uses little more
 than one core, so `dataset.collect` runs several calls at once, in threads. On a GPU, one call of `sense` renders a
-batch instead. Calls of `sense` and of embree are timed alternately, and the figures are medians. A ratio is embree's
-seconds divided by the seconds of `sense`, with the same number of threads.
+batch instead. Calls of `sense` and of embree are timed alternately, and the figures are medians.
 
-A second table has the share of each stage in the time of `sense`. At 640x480 it also has the speed relative to the
-paper's code, whose renderer and shader we once measured at 0.40 s per frame on a CPU, without physics.
+The first table has the frames per second. For each of the three ways, it also has the ratio of embree's seconds to the
+seconds of `sense`, with the same number of threads.
+
+The second table has the share of each stage in the time of `sense`. At 640x480 it also has the speed relative to the
+code of the paper (Rezaei-Shoshtari et al. 2021). We once measured 0.40 s per frame for the renderer and the shader of
+this code on a CPU, without physics.
 """
 
 import concurrent.futures
@@ -155,7 +158,8 @@ def embree(body: objects.Body, poses: jax.Array, shape: tuple[int, int]) -> dict
         shape: Height and width of the images (pixels).
 
     Returns:
-        A dictionary with the keys `traced`, `built` and `trimesh`. Each value is a list with a function for each pose.
+        A dictionary with the keys `traced`, `built` and `trimesh`, which the docstring of the module defines. Each
+        value is a list with a function for each pose.
     """
     camera = sts.Sensor().camera
     faces = np.asarray(body.faces)
@@ -189,7 +193,7 @@ def embree(body: objects.Body, poses: jax.Array, shape: tuple[int, int]) -> dict
 
 
 def median_seconds(*works: Callable[[], object], repeats: int = 7) -> list[float]:
-    """Median seconds of each function, from `repeats` alternating calls."""
+    """Median seconds of each function. All functions are called in turn, `repeats` times."""
     return np.median(in_turn(*works, repeats=repeats), axis=0).tolist()
 
 
@@ -235,7 +239,7 @@ def speed() -> None:
 
 
 def cases() -> Iterator[Case]:
-    """Yield every object with every number of faces at every size."""
+    """Yield a case for each combination of object, number of faces and image size."""
     for category in CATEGORIES:
         for faces in FACES:
             body = finer(objects.make(jax.random.key(0), category), faces)
@@ -272,7 +276,7 @@ def measure(case: Case) -> Durations:
 
 
 def rates(case: Case, found: Durations) -> str:
-    """Format a row of the first table: frames per second and ratios, in one thread and in all threads."""
+    """Format a row of the first table: frames per second, and ratios of embree's seconds to those of `sense`."""
     row = [f"{case.name} |"]
     for mine, theirs in ((found.frame, found.embree), (found.at_once, found.embree_at_once)):
         row += [f"{1 / mine:8.1f}  {1 / theirs[0]:6.0f}", *(f"{t / mine:6.2f}" for t in theirs), "|"]
@@ -305,7 +309,7 @@ def ball(shape: tuple[int, int], pitch: float, *, radius: float = 4e-3, depth: f
 
 
 def waves(shape: tuple[int, int], pitch: float, *, depth: float = 1e-3) -> np.ndarray:
-    """Imprint of waves that fills an image. Arguments and result are those of `ball`."""
+    """Imprint of waves over a whole image. The arguments and the result are those of `ball`, without `radius`."""
     y, x = ((np.arange(n) - (n - 1) / 2) * pitch for n in shape)
     return (depth * (0.6 + 0.2 * np.sin(2e3 * x)[None, :] + 0.2 * np.sin(1.4e3 * y)[:, None])).astype(np.float32)
 
@@ -357,7 +361,8 @@ def cost_of(faces: int, height: int, width: int) -> dict[str, float]:
         width: Width of the image (pixels).
 
     Returns:
-        `faces`: number of faces. `seconds`: seconds per frame. `bytes`: peak memory of this process.
+        A dictionary with the number of faces (`faces`), the seconds per frame (`seconds`) and the peak memory of this
+        process (`bytes`).
     """
     body, shape = finer(objects.make(jax.random.key(0), "bottle"), faces), (height, width)
     poses, wrenches = resting(body, 1 if shape == COST_SIZES[-1] else 4)  # four frames of this size are 0.2 GiB
@@ -367,7 +372,7 @@ def cost_of(faces: int, height: int, width: int) -> dict[str, float]:
 
 
 def cost() -> None:
-    """Print and plot the time and the memory of a frame for several numbers of pixels and of faces.
+    """Print the time and the memory of a frame for several numbers of pixels and of faces, and plot the time.
 
     Each combination is measured in a new process.
     """

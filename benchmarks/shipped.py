@@ -83,7 +83,7 @@ def collection(args: Args) -> dataset.Collection:
 
 
 def if_calibrated(confidence: np.ndarray, *, draws: int = DRAWS, seed: int = 0) -> float:
-    """The mean calibration error of outcomes that are drawn from the probabilities themselves.
+    """Mean calibration error when the outcomes are drawn from the predicted probabilities.
 
     Args:
         confidence: Probability of the likeliest outcome of each trajectory, `(n,)`.

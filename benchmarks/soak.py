@@ -11,8 +11,8 @@ trajectories. A trajectory is unsettled if the object is neither at rest nor off
 counts the trajectories that `simulate` discarded and drew again, because they were not finite or because the object
 sank deeper into the pad than `physics.simulation.SUNK_LIMIT`.
 
-The command compares the wrench at rest with the weight, and the energy in frames without contact with the energy at
-the start. All results are printed.
+The command compares the wrench at rest with the weight. For the frames without contact, it compares the energy of the
+object with the energy at the start. All results are printed.
 
 The trajectories are simulated in blocks of 504, or of fewer if fewer are requested. `benchmarks.hidden --soaked FOLDER`
 analyses the blocks that `--keep FOLDER` has kept.
