@@ -124,7 +124,9 @@ def simulated_dataset(folder: Path, resolution: tuple[int, int] | None) -> Side:
         )
     own = tuple(data.collection["resolution"])
     if resolution is not None and resolution != own:
-        raise ValueError(f"--resolution is {resolution}, but the images of {folder} have {own}: leave out --resolution")
+        raise ValueError(
+            f"--resolution is {resolution}, but the images of {folder} have the size {own}: leave out --resolution"
+        )
     pairs = data.pairs(data.rendered())
     return side(pairs.visual, pairs.tactile, pairs.trajectory, f"{folder}, a dataset of {own[0]} x {own[1]}")
 
@@ -164,8 +166,8 @@ def load(config: Config) -> tuple[Side, Side]:
         numbers of real trajectories.
 
     Raises:
-        FileNotFoundError: A folder contains no session or dataset.
-        ValueError: Two options contradict each other, or there is nothing to compare.
+        FileNotFoundError: A folder contains no session or dataset, or there is no sensor file.
+        ValueError: An option is out of range, two options contradict each other, or there is nothing to compare.
     """
     is_dataset = (config.simulated / "collection.json").exists()
     if is_dataset and config.match == "number":

@@ -1,6 +1,6 @@
 """Predict images of the object at rest from the live images of a sensor, and show the live and the predicted images.
 
-    python -m experiments.live                                            # starts a digital twin and opens a page
+    python -m experiments.live                                            # starts a digital twin and serves a web page
     python -m experiments.live --sensor bench                             # the sensor of a sensor file
     python -m experiments.live --camera URL --leds PORT --sensor bench    # replaces the device paths of the file
     python -m experiments.live --sensor bench --record runs/monday        # also records both streams

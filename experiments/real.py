@@ -5,7 +5,7 @@
     python -m experiments.real --preset smoke     # a short run of every stage, for tests
     python -m experiments.real --plan             # prints the expected seconds of each stage
 
-    python -m experiments.real collect --sensor bench --count 500   # opens a page for the browser
+    python -m experiments.real collect --sensor bench --count 500   # shows a page in the browser
     python -m experiments.real collect --camera /dev/v4l/by-id/... --leds /dev/ttyACM0    # without a sensor file
     python -m experiments.real collect --twin --workdir runs/twin   # the digital twin, on a virtual clock
     python -m experiments.real review                       # lists the trajectories

@@ -116,5 +116,5 @@ def test_a_dataset_is_compared_without_a_match_at_its_own_resolution(folder, tmp
     np.testing.assert_array_equal(simulated.images.tactile[4:6], pairs.tactile[0])
     command.main(options)
     assert "a dataset of 64 x 64, 5 trajectories" in capsys.readouterr().out
-    with pytest.raises(ValueError, match=r"resolution is \(96, 128\), but the images of .* have \(64, 64\)"):
+    with pytest.raises(ValueError, match=r"resolution is \(96, 128\), but the images of .* have the size \(64, 64\)"):
         command.load(dataclasses.replace(options, resolution=SIZE))

@@ -219,13 +219,17 @@ class AutomaticTerminal(AutomaticPerson):
         self._terminal = Terminal(count, keys=False)
 
     def show(self, view: View) -> None:
-        """Print the instruction or the problem of a view, if these or the number of the trajectory have changed."""
+        """Print `view.problem`, or `view.instruction` if there is no problem.
+
+        Nothing is printed if the instruction, the problem and the number of the trajectory are the same as in the
+        previous call.
+        """
         super().show(view)
         self._terminal.show(view)
 
 
 class AutomaticPage(AutomaticPerson):
-    """Confirms every trajectory automatically, and shows a page whose buttons can also be pressed."""
+    """A `Person` that confirms every trajectory automatically and shows a page whose buttons can also be pressed."""
 
     def __init__(self, page: Page):
         super().__init__()

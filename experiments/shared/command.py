@@ -90,7 +90,7 @@ def run(presets: Mapping[str, Config], workdir: str, description: str | None) ->
 def parse(presets: Mapping[str, Config], workdir: str, description: str | None) -> Args:
     """Read the options of the command line.
 
-    Fields of the configuration whose options are not given keep the values of the preset.
+    A field of the configuration keeps the value of the preset if its option is not given.
 
     Args:
         presets: Configurations by name. The name `default` must be among them.

@@ -203,7 +203,7 @@ class Live:
             return statistics.median(self._latencies_s) if self._latencies_s else None
 
     def close(self) -> None:
-        """Stop the thread."""
+        """Stop the prediction thread."""
         with self._changed:
             self._stopped = True
             self._changed.notify_all()

@@ -100,7 +100,11 @@ class Page(Site):
         return None if pair is None else getattr(pair, stream).image
 
     def still(self, path: str) -> Image | None:
-        """The current trajectory's image at a URL path such as `end/initial/visual.jpg`, or None if there is none."""
+        """The image of the current trajectory at a URL path such as `end/initial/visual.jpg`.
+
+        The path selects the initial or the final pair of images, and the visual or the tactile image of this pair.
+        The result is None if the image was not taken yet, or if the path has another form.
+        """
         head, _, rest = path.partition("/")
         end, _, name = rest.partition("/")
         stream = name.removesuffix(".jpg")

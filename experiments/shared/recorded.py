@@ -139,7 +139,10 @@ def missing(config: Config, workdir: Path) -> int:
 
 
 def samples(config: Config, count: int) -> int:
-    """The number of training samples from `count` trajectories, including the copies that `augmented` makes."""
+    """The number of training samples from `count` trajectories, including the copies that `augmented` makes.
+
+    `count` includes the trajectories that are held out for validation, but they yield no training samples.
+    """
     return round((1 - config.held_out) * count) * (1 + config.shifts) * (2 if config.rest else 1)
 
 
@@ -191,8 +194,8 @@ def jobs(config: Config, data: Recorded) -> Iterator[stages.Job]:
         arrays, own = training.image_arrays(visual, tactile, modalities, preprocessing, blank)
         if own.absent:
             raise ValueError(
-                "none of the initial tactile images for training shows a contact: write a sheet of the images with "
-                "`python -m experiments.real review --sheet review.png`, and compare it with the tactile background "
+                "none of the initial tactile images for training shows a contact: draw the newest images with "
+                "`python -m experiments.real review --sheet review.png`, and compare them with the tactile background "
                 "image that sensor.json names"
             )
         schedule = config.training

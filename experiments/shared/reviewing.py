@@ -20,7 +20,7 @@ PANEL = 200  # width of an image on the sheet (pixels)
 
 @dataclasses.dataclass(frozen=True)
 class Review:
-    """List the trajectories, discard, restore or confirm some of them, check their files, or draw their images."""
+    """List, discard, restore or confirm trajectories, check their files, or draw their images."""
 
     workdir: Folder = Path("runs/real")  # work directory. The trajectories are in its folder `dataset`
     discard: tuple[int, ...] = ()  # numbers of trajectories to move to the folder `discarded`
