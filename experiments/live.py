@@ -323,7 +323,7 @@ def summarise(live: Live, sensor: hardware.STS | hardware.Replay, duration_s: fl
 
 
 def main(config: Config) -> None:
-    """Open the model, the source and the page, and run until the end."""
+    """Open the model, the source and the page, and predict until the source ends or the user stops the command."""
     with errors.on_one_line(debug=config.debug):
         try:
             check(config)

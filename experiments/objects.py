@@ -6,10 +6,10 @@ The command takes about half a minute on two CPU cores for 8 x 10 objects. `--vi
 sees them, and `--view below` shows the objects as the sensor sees them. `--shuffle` draws the objects in random order
 without names, so that other people can try to recognise them.
 
-A line is printed for each object: its size, its number of faces, its collision hull, and two gaps. The first gap is the
-largest distance by which the surface lies outside the hull. The second gap is the largest distance by which the hull
-lies outside the surface. If the hull of an object fits badly, `--parts` first decomposes the object into convex parts,
-which takes about ten seconds per object.
+A line is printed for each object: its size, its number of faces, the number of vertices of its collision hull, and two
+gaps. The first gap is the largest distance by which the surface lies outside the hull. The second gap is the largest
+distance by which the hull lies outside the surface. If the hull of an object fits badly, `--parts` first decomposes the
+object into convex parts, which takes about ten seconds per object.
 """
 
 import dataclasses

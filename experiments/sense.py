@@ -5,8 +5,9 @@
     python -m experiments.sense classes --out classes.png --resolution 1232 1640    # all eight, about a minute
 
 By default, the object is at rest under its own weight. The picture shows six images: the visual image, an image with
-the LEDs at half power, the tactile image, depth, segmentation and pressure. The command prints the size of the object,
-the face on which it rests, and how deep it sinks into the gel.
+the LEDs at half power, the tactile image, depth, segmentation and pressure. With `classes`, the picture shows only the
+first three images of each object. The command prints the size of the object, the face on which it rests, and how deep
+it sinks into the gel.
 """
 
 import dataclasses
@@ -146,8 +147,8 @@ def lay(config: Config, sensor: sts.Sensor, body: sts.objects.Body) -> tuple[np.
     shares = sts.physics.stable_faces(body, fill=FILL).share
     if not 0 <= config.rest < len(shares):
         raise ValueError(
-            f"--rest is {config.rest}, but it must be an index from 0 to {len(shares) - 1}, because the object can "
-            f"rest on {len(shares)} faces"
+            f"--rest is {config.rest}, but it must be the index of a face on which the object can rest, from 0 to "
+            f"{len(shares) - 1}"
         )
     rest = sts.physics.place(body, sensor, face=config.rest, fill=FILL)
     turn = Rotation.from_quat(np.asarray(rest.pose[3:], float), scalar_first=True)

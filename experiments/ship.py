@@ -72,7 +72,10 @@ def ship(workdir: Path, name: str) -> str:
 
 
 def compare(original: sts.Predictor, rounded: sts.Predictor) -> str:
-    """Compare the predictions of two models from visual images, and return a line with the differences."""
+    """Return a line with the differences between the predictions of two models.
+
+    Both models predict from the same visual images, which `bottles` renders.
+    """
     visual = bottles(original.preprocessing)
     half = np.array(original.preprocessing.condition_scale, np.float32) / 2
     condition = np.tile(half, (len(visual), 1)) if half.size else None

@@ -43,8 +43,8 @@ def main(config: Config) -> None:
     """Simulate the trajectories, render them from outside and through the sensor, and draw them.
 
     Raises:
-        ValueError: The scenario is unknown, or `num` is less than 1.
-        OSError: The folder cannot be written to.
+        ValueError: The scenario is unknown, or `config.num` is less than 1.
+        OSError: The folder `config.out` cannot be written to.
     """
     if config.scenario not in SCENARIOS:
         raise ValueError(f"scenario is {config.scenario!r}, but it must be one of {', '.join(SCENARIOS)}")

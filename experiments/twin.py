@@ -99,7 +99,10 @@ def make(config: Config) -> twin.Twin:
 
 
 def main(config: Config) -> None:
-    """Serve the twin until Ctrl-C or SIGTERM."""
+    """Serve the twin until Ctrl-C or SIGTERM.
+
+    If `config.attached` is true, the end of the standard input also stops the twin.
+    """
     stop = threading.Event()
     print("preparing the first images ...", flush=True)
     with make(config) as device:

@@ -250,6 +250,21 @@ def test_keys_of_a_terminal(monkeypatch, capsys):
     assert "[4 of 7] trajectory 0: Do." in capsys.readouterr().err
 
 
+def test_lines_of_a_pipe_act_like_keys(monkeypatch):
+    receiver, sender = os.pipe()
+    with os.fdopen(receiver) as pipe:
+        monkeypatch.setattr(sys, "stdin", pipe)
+        keys = Terminal()
+        keys.show(view())
+        keys.show(view())
+        os.write(sender, b"help\n\r\nD\nq\n")
+        assert [keys.action() for _ in range(3)] == [Action.CONFIRM, Action.DISCARD, Action.STOP]
+        os.write(sender, b"x\n")
+        assert keys.action() is None
+        os.close(sender)
+        assert keys.action() is Action.STOP
+
+
 def test_the_end_of_the_input_stops(monkeypatch):
     with open(os.devnull) as nothing:
         monkeypatch.setattr(sys, "stdin", nothing)

@@ -141,7 +141,7 @@ def test_a_sensor_of_a_file_is_used(box, tmp_path):
         ({"force": -1.0}, "--force is -1.0, but it must be >= 0"),
         ({"position": (0.0, np.inf)}, "position is .*finite"),
         ({"light": 1.5}, "light is 1.5"),
-        ({"rest": 99}, r"--rest is 99, but it must be an index from 0 to \d+, because the object can"),
+        ({"rest": 99}, r"--rest is 99, but it must be the index of a face .* can rest, from 0 to \d+"),
         ({"mesh": "bottle", "longest_side": 0.1}, "--longest-side is for mesh files, but bottle is an object class"),
         ({"longest_side": 0.2}, "longest_side is 0.2 m, but the sensor's pad is 0.15 m wide"),
         ({"scale": 100.0}, r"longest side is 4 m, but it must be at most 0.15 m, .* pad: give longest_side"),

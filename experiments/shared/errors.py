@@ -1,4 +1,4 @@
-"""Reports of errors and warnings by the commands, and their end after a signal."""
+"""Prints the errors and warnings of a command on one line each, and ends a command that receives SIGTERM."""
 
 import contextlib
 import signal
@@ -51,7 +51,7 @@ def _note(message: Warning | str, *_: Any, **__: Any) -> str:
 
 
 def interrupt_on_sigterm() -> None:
-    """Raise a `KeyboardInterrupt` when the process receives SIGTERM, so that files are written as after Ctrl+C."""
+    """Make SIGTERM raise a `KeyboardInterrupt`, so that the process writes its files and ends as after Ctrl+C."""
 
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt

@@ -166,7 +166,7 @@ def main_rows(model: str, titles: Sequence[str]) -> list[str]:
 
     Args:
         model: Title of the main model.
-        titles: Titles of all rows of models.
+        titles: Titles of the rows of all models.
     """
     wanted = [f"{model}, from {given}" for given in MAIN_SUBSETS]
     return [evaluation.CEILING, *evaluation.BASELINES, *[title for title in wanted if title in titles][:5]]

@@ -81,14 +81,14 @@ class Views:
     def prepared(self, visual: Image, tactile: Image, empty: Mapping[str, np.ndarray]) -> hardware.SensorView:
         """Convert raw images to the inputs of a model.
 
-        If `backgrounds` is not None and `backgrounds.divided` is True, the brightness and the colours of the images are
-        adapted to the training images of the model (`hardware.relit`).
+        If `self.backgrounds` is not None and `self.backgrounds.divided` is True, `hardware.relit` adapts the brightness
+        and the colours of the images to the sensor on which the model was trained.
 
         Args:
             visual: Raw visual image.
             tactile: Raw tactile image.
-            empty: Images of the untouched sensor in the model's training (`Predictor.empty`). The result has
-                the same resolution as these images.
+            empty: Images of the empty pad of the sensor on which the model was trained (`Predictor.empty`). The result
+                has the same resolution as these images.
         """
         model = hardware.SensorView(**empty)
         rows, columns = model.visual.shape[:2]

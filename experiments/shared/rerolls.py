@@ -23,7 +23,7 @@ FORMAT = 2  # version of the files (2: outcomes are decided by the ratio of prob
 class Ceilings(NamedTuple):
     """Re-rolls (new simulations) of held-out trajectories, and the scores of predictions made from the re-rolls.
 
-    In the tables of results, the row `ceiling` shows the score of the mean of the re-rolls.
+    In the tables of results, the ceiling is the score of the mean of the re-rolls.
     """
 
     scores: dict[str, evaluation.Scores]  # scores of the mean of the re-rolls, and of a single re-roll

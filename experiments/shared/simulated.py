@@ -74,12 +74,13 @@ class Hand(twin.Hand):
 def collect(config: Simulated) -> None:
     """Collect trajectories until `config.count` are confirmed, or continue an interrupted collection.
 
-    The twin (`ObjectScene`) simulates a fixed sequence of trajectories for each seed. A trajectory has the same number
-    in this sequence and in the session. A continued collection starts with the next number of the session. Therefore,
-    it repeats no trajectory.
+    The twin (`ObjectScene`) simulates a fixed sequence of trajectories for each seed. A recorded trajectory keeps its
+    number in this sequence. A continued collection starts with the largest recorded number plus 1, so that no
+    trajectory is repeated.
 
     Raises:
-        ValueError: The work directory contains data of another sensor or with other options.
+        ValueError: The work directory contains data of another sensor, or of a twin with another seed, image size or
+            LED levels.
         LockedError: Another process collects into the work directory.
         SensorFileError: The sensor file in the work directory is damaged.
         OSError: A file cannot be written.
@@ -113,7 +114,7 @@ def collect(config: Simulated) -> None:
 
 
 def lens(config: Simulated, sensor: sts.Sensor) -> hardware.Lens:
-    """Make the lens of the twin."""
+    """Make the lens of the twin, an equidistant lens with a field of view of 160 degrees across the diagonal."""
     return hardware.Lens.ideal(
         *config.size, field_of_view=math.radians(FIELD_OF_VIEW), distance=float(sensor.camera.distance)
     )
@@ -154,8 +155,8 @@ def commissioned(config: Simulated, device: twin.Twin) -> tuple[twin.VirtualSens
     if (there.width, there.height, there.levels) != (*config.size, config.levels):
         raise ValueError(
             f"{file} is for images of {there.width} x {there.height} pixels and the LED levels {there.levels}, but the "
-            f"options give {config.size[0]} x {config.size[1]} pixels and the levels {config.levels}: choose another "
-            "--workdir, or set --size and --levels to the values in the file"
+            f"twin is set to {config.size[0]} x {config.size[1]} pixels and the levels {config.levels}: choose another "
+            "--workdir, or run `python -m experiments.real collect --twin` with the --size and --levels of the file"
         )
     settling = hardware.Settling(there.settle_off_s, there.settle_on_s)
     sensor = twin.VirtualSensor(device, levels=config.levels, settling=settling)
@@ -163,7 +164,7 @@ def commissioned(config: Simulated, device: twin.Twin) -> tuple[twin.VirtualSens
 
 
 def commission(config: Simulated, device: twin.Twin) -> None:
-    """Measure the settling times, record the backgrounds, and write the sensor file."""
+    """Measure the settling times of the twin's LEDs, record images of its empty pad, and write the sensor file."""
     simulated = sts.Sensor()
     sensor = twin.VirtualSensor(device, levels=config.levels)
     recorded = backgrounds.record(sensor)

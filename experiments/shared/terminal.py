@@ -57,17 +57,20 @@ class Terminal:
             if not data:
                 say("the standard input has ended")
                 return Action.STOP
-            if (action := KEYS.get(data.decode(errors="replace").lower())) is not None:
-                if action is not Action.CONFIRM and not sys.stdin.isatty():
-                    self._rest_of_line()
-                if action is Action.STOP or self._stages[0] is self._stages[1]:
-                    return action
+            key = data.decode(errors="replace")
+            if not sys.stdin.isatty():
+                key = self._line(data).decode(errors="replace").strip() or "\n"
+            if (action := KEYS.get(key.lower())) is not None and (
+                action is Action.STOP or self._stages[0] is self._stages[1]
+            ):
+                return action
         return None
 
-    def _rest_of_line(self) -> None:
-        """Skip to the end of the line, so that its line feed does not count as Enter."""
-        while os.read(sys.stdin.fileno(), 1) not in (b"\n", b""):
-            pass
+    def _line(self, line: bytes) -> bytes:
+        """Read the rest of a line whose first byte was read already."""
+        while not line.endswith(b"\n") and (more := os.read(sys.stdin.fileno(), 1)):
+            line += more
+        return line
 
 
 @contextlib.contextmanager
