@@ -179,7 +179,10 @@ def measure_all(args: Args) -> list[Measured]:
 
 
 def main(args: Args) -> str:
-    """Read the pairs at all lags, write the table of the results to `--out` if given, and return the table."""
+    """Read pairs of images with each delay of the camera (`--lags-ms`), and return a table of the results.
+
+    If `--out` is given, the table is also written to this file.
+    """
     found = measure_all(args)
     load = os.getloadavg()[1] if hasattr(os, "getloadavg") else float("nan")
     text = (

@@ -287,10 +287,10 @@ def row(name: str, first: gap.Streams, second: gap.Streams, *, matched: bool) ->
 
 
 def table(clean: gap.Streams, resolution: tuple[int, int]) -> Iterator[str]:
-    """Compare clean images with changed ones, and yield the lines of the table.
+    """Yield the lines of the table, which compares images without imperfections with changed copies of these images.
 
     Args:
-        clean: Images of the clean session at the resolution of the twin's camera.
+        clean: Images without imperfections, at the resolution of the twin's camera.
         resolution: Height and width at which images are compared (pixels).
     """
     visual, tactile = (np.stack([reduced(image, resolution) for image in images]) for images in clean[:2])

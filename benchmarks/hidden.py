@@ -230,16 +230,16 @@ def painted(body: objects.Body) -> objects.Body:
 
 
 def aloft(key: PRNGKeyArray, items: list[objects.Body], num: int) -> tuple[Starts, np.ndarray, np.ndarray]:
-    """Render falling objects in the air.
+    """Render objects in the air at the start of a fall.
 
     Args:
         key: Random key.
         items: The objects.
-        num: Number of starts of each object.
+        num: Number of falls of each object.
 
     Returns:
-        The starts, their visual images, and the same images with a tint (`painted`) on all objects that are more than
-        half full. The images are uint8 `(n, 64, 64, 3)` each.
+        The starts of the falls, their visual images, and the same images with a tint (`painted`) on all objects that
+        are more than half full. The images are uint8 `(n, 64, 64, 3)` each.
     """
     starts = roll(key, items, physics.Freefall(frames=11), num)  # 11 frames are the minimum of the scenario
     plain, _ = draw(items, starts)

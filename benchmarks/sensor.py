@@ -224,7 +224,10 @@ def frames(
 
 
 def speed() -> None:
-    """Print the rates of `sense` and embree, with a row for each object and size, then the share of each stage."""
+    """Print frames per second of `sense` and embree, with a row for each object and image size.
+
+    A second table has the share of the time that each stage of `sense` takes.
+    """
     every = f"{os.cpu_count()} threads" if jax.default_backend() == "cpu" else "batched"
     print(f"frames /s, and embree's seconds over ours: traced, built, trimesh; {jax.devices()[0].device_kind}")
     print(f"{'object':9} {'faces':>6} {'image':>9} | {'one thread':>37} | {every:>37}")

@@ -65,7 +65,7 @@ class Args:
 
 
 def collection(args: Args) -> dataset.Collection:
-    """Description of a dataset with new objects for the model's experiment.
+    """Describe a dataset of the experiment `args.model` with new objects, which no model was trained on.
 
     The training split contains a fifth of the objects, which only define the baselines and the frequencies of the
     outcomes. The test split contains the other objects. The validation split is empty.

@@ -208,7 +208,10 @@ def report(name: str, found: dict[str, np.ndarray]) -> str:
 
 
 def main(args: Args, folder: Path) -> None:
-    """Simulate the requested blocks that the folder lacks, and print the results of all requested blocks."""
+    """Simulate the trajectories of each requested scenario in blocks, and print the results.
+
+    A block is stored as a file in `folder`. Blocks that are there already are not simulated again.
+    """
     size = min(BLOCK, -(-args.num // NUM) * NUM)
     for name in [args.only] if args.only else list(SCENARIOS):
         claim(folder, name, size)

@@ -70,14 +70,14 @@ def ridge(x: np.ndarray, y: np.ndarray, x_new: np.ndarray, penalty: float = 1.0)
 
 
 def saturated(tactile: np.ndarray, blank: np.ndarray) -> np.ndarray:
-    """Find the saturated pixels of imprints.
+    """Find out which pixels of imprints are saturated. An imprint is the part of an image that differs from `blank`.
 
     Args:
         tactile: Tactile images, uint8 `(n, h, w, 3)`.
         blank: Tactile image of the untouched sensor, uint8 `(h, w, 3)`.
 
     Returns:
-        For every imprint pixel of all images, True if one of its channels is 0 or 255.
+        One Boolean for each pixel of the imprints in all images. It is True if a channel of the pixel is 0 or 255.
     """
     touched = np.abs(tactile.astype(int) - blank).max(-1) > 3
     return np.any((tactile == 0) | (tactile == 255), -1)[touched]

@@ -216,7 +216,7 @@ def report(real: Side, simulated: Side, *, matched: bool) -> str:
 
 
 def measured(real: gap.Streams, simulated: gap.Streams, stream: str, *, matched: bool) -> dict[str, str]:
-    """Compare the real and the simulated images of one stream, and return the name and the text of each measure."""
+    """Compare the real and the simulated images of one stream. Return formatted values by the names of the metrics."""
     first, second = getattr(real, stream), getattr(simulated, stream)
     rows = {}
     if matched:

@@ -134,7 +134,10 @@ def check(config: Config) -> None:
 
 @contextlib.contextmanager
 def opened(config: Config) -> Iterator[Source]:
-    """Make the source that the options select. A twin starts on entry to the context, and stops on exit."""
+    """Make the source of images that the options select: a replay, a real sensor or a digital twin.
+
+    A digital twin is started here, and stopped at the end of the `with` block.
+    """
     if config.replay:
         yield replayed(config)
     elif config.camera is not None and config.leds is not None and config.sensor is None:
@@ -323,7 +326,7 @@ def summarise(live: Live, sensor: hardware.STS | hardware.Replay, duration_s: fl
 
 
 def main(config: Config) -> None:
-    """Open the model, the source and the page, and predict until the source ends or the user stops the command."""
+    """Load the model, open the source of images and the web page, and predict until the images end or a user stops."""
     with errors.on_one_line(debug=config.debug):
         try:
             check(config)

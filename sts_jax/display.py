@@ -219,8 +219,8 @@ def _image(thing: Any) -> np.ndarray:
     """Check that an argument is an RGB image, and return it as floats in [0, 1]."""
     if not isinstance(thing, np.ndarray | jax.Array):
         raise TypeError(
-            f"`thing` has the type {type(thing).__name__}, but it must be a Frame, or an image as an array "
-            "(height, width, 3). sts.show also draws a Body or a Prediction"
+            f"`thing` has the type {type(thing).__name__}, but it must be a Frame or an image, which is an array "
+            "(height, width, 3). In sts.show, it may also be a Body or a Prediction"
         )
     image = np.asarray(thing)
     if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:

@@ -1,7 +1,6 @@
-"""Features from which a classifier predicts the outcomes of lathed objects on the jerked pad (`physics.Perturbed`).
+"""Features from which a classifier predicts the outcomes of bottles on a jerked pad (`physics.Perturbed`).
 
-The features come from vision, and optionally from the measured mass. A lathed object is a solid of revolution, such as
-a bottle.
+The features come from vision, and optionally from the measured mass. They are suitable for all solids of revolution.
 """
 
 from typing import NamedTuple

@@ -202,7 +202,7 @@ class SensorPeer:
         self.leds.vanish()
 
     def shown(self) -> dict[int, Shown]:
-        """Return the number and the mean light of each frame. The keys are the numbers that `key` reads from images."""
+        """Return the `Shown` of each frame, in a dictionary whose keys are the numbers (`key`) of the frames."""
         return {number: Shown(number, exposure.mean) for number, exposure in self.camera.log.items()}
 
 

@@ -67,7 +67,7 @@ class TwinPeer:
         self.twin.close()
 
     def shown(self) -> dict[int, Shown]:
-        """Return the number and the mean light of each frame. The keys of the dict are checksums computed by `key`."""
+        """Return the `Shown` of each frame, in a dictionary whose keys are the checksums (`key`) of the frames."""
         _, *parts = self._record.read_bytes().split(_START)
         frames = zip(parts, twin.read_log(self._log), strict=True)
         return {key(photometry.decode(_START + part)): Shown(frame.index, frame.light) for part, frame in frames}

@@ -46,8 +46,8 @@ def plan(config: Config, *, num: int = 64, steps: int = 4) -> str:
 
     Args:
         config: Configuration of the experiment.
-        num: Number of simulated trajectories, a multiple of 8. The first and the last frame of each trajectory are rendered once for
-            each symmetry (rotation or reflection) of the scenario.
+        num: Number of simulated trajectories, a multiple of 8. The first and the last frame of each trajectory are
+            rendered once for each symmetry (rotation or reflection) of the scenario.
         steps: Number of gradient steps of each model.
 
     Returns:

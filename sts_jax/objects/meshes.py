@@ -330,8 +330,8 @@ def _body(
         fault = "encloses no volume" if closed else "is not closed"
         if strict:
             raise ValueError(
-                f"{path}: the mesh {fault}: repair the mesh, or give strict=False, so that its convex hull bounds the "
-                "contents of a hollow object"
+                f"{path}: the mesh {fault}: repair the mesh, or give strict=False. If the object is hollow, its "
+                "contents then fill the convex hull of the mesh"
             )
         if holds:
             warnings.warn(

@@ -153,7 +153,7 @@ class Released(Scenario):
 
         `start` places an object on an edge between two of its faces, usually with the narrower face at less than 45
         degrees to the pad. If the two faces meet at a right angle, the wider face is then at more than 45 degrees to
-        the pad. An object that turns by less than 45 degrees can therefore only come to rest on the narrower face.
+        the pad. In this usual case, an object that turns by less than 45 degrees comes to rest on the narrower face.
         """
         before, after = (geometry.quat_to_matrix(geometry.normalize(pose[3:]))[2] for pose in (first, last))
         stays = jnp.where(before @ after < math.cos(TURNED), Outcome.TOPPLES, Outcome.RETURNS)

@@ -138,7 +138,7 @@ class Blender:
         return Ends(self._end(visual), self._end(tactile))
 
     def blend(self, ends: Ends, light: float) -> np.ndarray:
-        """Mix the two images in `ends` into a camera frame without noise.
+        """Mix the images of the scene with LEDs off and with LEDs on into a camera frame without noise.
 
         If `Imperfections.leakage` and `Imperfections.vignetting` are 0 and there is no lens distortion, the frame
         equals the image of `sts_jax.expose` up to rounding.
@@ -156,7 +156,7 @@ class Blender:
         return self._to_srgb[self._mixed(ends, light)]
 
     def frame(self, ends: Ends, light: float) -> np.ndarray:
-        """Mix the two images in `ends` into a camera frame, and add the read noise and shot noise of `Imperfections`.
+        """Mix the images of the scene with LEDs off and with LEDs on into a camera frame, and add the noise.
 
         Args:
             ends: Images of the scene, as `Blender.ends` returns them.
