@@ -269,7 +269,8 @@ def _field_conditions(
         if isinstance(default, jax.Array) and not isinstance(value, jax.Array | np.ndarray):
             raise ValueError(f"field {name} is {value!r}, but it must be a NumPy or JAX array.")
         if static and not all(isinstance(number, int | np.integer) for number in numbers):
-            raise ValueError(f"field {name} is {value!r}, but only integers (int or np.integer) are allowed.")
+            whose = "its numbers" if isinstance(value, tuple) else "it"
+            raise ValueError(f"field {name} is {value!r}, but {whose} must have the type int or np.integer.")
         yield from _value_conditions(default, value, name, metadata)
         return
     if type(value) is not type(default):

@@ -240,14 +240,14 @@ def test_the_lens_is_fitted_from_a_folder(tmp_path, pictures, capsys):
 
 
 def test_boards_that_do_not_reach_the_corners_are_refused(tmp_path, pictures):
-    with pytest.raises(hardware.CalibrationError, match=r"the view's|corners of the sensor's view are 5\d"):
+    with pytest.raises(hardware.CalibrationError, match=r"corners of the sensor's view are up to 5\d"):
         hardware.check_view(TRUE, PINHOLE, math.radians(40))
     hardware.check_view(TRUE, PINHOLE, hardware.view_angle(TRUE, PINHOLE))
 
 
 def test_a_view_that_the_camera_does_not_see_is_refused(config):
     shifted = dataclasses.replace(hardware.Lens.ideal(WIDTH, HEIGHT), cx=60.0)
-    with pytest.raises(hardware.CalibrationError, match=r"\d% of .* outside .*middle left.*centre of the pad"):
+    with pytest.raises(hardware.CalibrationError, match=r"\d% of .*middle left.* outside .*centre of the pad"):
         hardware.check_view(shifted, PINHOLE)
     with pytest.raises(hardware.CalibrationError, match="larger field of view"):
         commission.main(dataclasses.replace(config, ideal_lens=90.0))

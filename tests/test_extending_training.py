@@ -114,7 +114,7 @@ def test_a_folder_is_not_resumed_with_another_loss_optimiser_or_note(tmp_path):
         run(optimiser=adam, notes=notes, progress=kill_at(5))
     with pytest.raises(ValueError, match=r"made with optimiser = 'given as optimiser=', but .* None"):
         run(notes=notes)
-    with pytest.raises(ValueError, match=r"settings have 'given as loss='"):
+    with pytest.raises(ValueError, match=r"settings have loss = 'given as loss='"):
         run(optimiser=adam, notes=notes, loss=half_square)
     with pytest.raises(ValueError, match=r"notes\.optimiser = 'Adam, 1e-3', but .* 'Adam, 1e-2'"):
         run(optimiser=optax.adam(1e-2), notes={"optimiser": "Adam, 1e-2"})
