@@ -1,4 +1,4 @@
 """Commands that measure speed, endurance, accuracy, and the information in tactile data.
 
-`python -m benchmarks.NAME --help` describes the command NAME.
+The option `--help` of each command describes the command.
 """

@@ -127,7 +127,7 @@ def test_a_body_is_drawn_from_outside():
     ("path", "thing", "error", "message"),
     [
         ("a.npz", np.zeros((2, 2, 3)), TypeError, "type ndarray, but `save` can write only .* Trajectory to an"),
-        ("a.png", 3.0, TypeError, "`thing` has the type float, but it must be a Frame, or an image"),
+        ("a.png", 3.0, TypeError, "`thing` has the type float, but it must be a Frame or an image"),
         (
             "a.png",
             BODY,
