@@ -29,7 +29,7 @@ def bilinear(
             inside.
 
     Returns:
-        Values at the points, (*n, *c).
+        Values at the points. Their shape is the shape of `column`, followed by the channel axes of `image`.
     """
     height, width = image.shape[:2]
     if wrap:

@@ -64,9 +64,8 @@ def skill(error: ImageError, constant: ImageError, weight: np.ndarray | None = N
     `reference_excess` is the same sum for the reference prediction.
 
     Args:
-        error: Errors of the predictor for n items.
-        constant: Errors of the reference prediction for the same items. The reference prediction is usually the mean
-            training image.
+        error: Cross-entropies and excesses of the predicted images of n items, from `image_error`.
+        constant: The same for the reference prediction, which is usually the mean training image.
         weight: Weights of the items, `(n,)` (default: 1).
 
     Returns:

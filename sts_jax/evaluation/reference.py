@@ -1,4 +1,4 @@
-"""The baselines, which predict without a trained model, and the names of the baselines and of the ceilings."""
+"""The baselines, which predict without a trained model, and the names of all rows in tables that are no models."""
 
 import numpy as np
 

@@ -40,7 +40,7 @@ class Background:
                 self._changed.notify_all()
 
     def latest(self) -> Pair | None:
-        """Return the newest pair, or None if no pair has been taken yet.
+        """Return the newest visual and tactile image as a pair, or None if no pair has been taken yet.
 
         If an error has ended the thread that takes the pairs, this method raises the same error.
         """

@@ -111,9 +111,10 @@ def _depth(points: Float[Array, "3 h"], model: mjx.Model) -> Float[Array, ""]:
 def step(model: mjx.Model, data: mjx.Data, hull: Hull, state: State, gravity: Float[Array, "3"]) -> State:
     """Advance a state by one time step.
 
-    The step adds the wrench of the pad on the object to the field `impulse` of the state. If the pad does not push the
-    object, `impulse` is set to 0 instead. The wrench is summed over all contacts with the pad, and its moment is about
-    the sensor's origin. If the scene has a stop wall, contacts with the wall are not part of the wrench.
+    The field `impulse` of the state is the sum of the wrenches of the pad on the object over successive steps with
+    contact. The step adds its own wrench to this sum, or sets the sum to 0 if the pad does not push the object. A
+    wrench is the total over all contacts with the pad, and its moment is about the sensor's origin. If the scene has a
+    stop wall, contacts with the wall are not part of the wrench.
 
     An object that is held, or that has left the pad, does not move, and its `impulse` is 0.
 

@@ -62,7 +62,11 @@ class _Surface(NamedTuple):
 def draw(
     sensor: Sensor, body: Body, resting: Resting, *, resolution: tuple[int, int], crop: bool, moving_edges: bool
 ) -> Images:
-    """Draw the images of an object. `resting` is the object in balance. The other arguments are those of `sense`."""
+    """Draw the images of an object whose pose on the gel is known.
+
+    `resting` is the result of the first program of `sense` (`rendering.equilibrium`). The other arguments are those of
+    `sense`.
+    """
     drawn = functools.partial(_draw, resolution=resolution, crop=crop, moving_edges=moving_edges)
     return looped(drawn)(sensor, body, resting)
 

@@ -71,8 +71,9 @@ class Config:
             )
         if self.condition < 0 or (self.condition and not 0 <= 2 * self.vectors <= self.condition):
             raise ValueError(
-                f"condition is {self.condition} and vectors is {self.vectors}, but vectors must be >= 0, and condition "
-                "must be 0 or at least 2 * vectors, because each vector has two numbers"
+                f"condition is {self.condition} and vectors is {self.vectors}, but condition (the number of values in "
+                "a scenario's condition) must be 0, or at least 2 * vectors with vectors >= 0, because a vector has "
+                "two of the values"
             )
         if self.traits < TINT:
             raise ValueError(

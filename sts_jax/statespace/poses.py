@@ -62,7 +62,10 @@ def certainty(code: Float[Array, "*n 12"]) -> Float[Array, "*n"]:
 
 
 def matrix(code: Float[Array, "*n 12"]) -> Float[Array, "*n 3 3"]:
-    """The rotation matrix in each pose code. The matrix in a mean of pose codes is a mean of rotation matrices."""
+    """Return the 3x3 matrix in each pose code, which has the position and the rotation matrix of an object.
+
+    In the mean of several pose codes, it is the mean of their rotation matrices, which is not a rotation in general.
+    """
     return code[..., 3:].reshape(*code.shape[:-1], 3, 3)
 
 

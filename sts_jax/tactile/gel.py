@@ -96,7 +96,7 @@ def indent(gel: Gel, heights: Float[Array, "r c"]) -> Equilibrium:
         heights: Heights of the object's underside above the gel's face (m), `inf` where there is no object.
 
     Returns:
-        Equilibrium without motion. `balanced` is True, because there is no wrench to balance.
+        The `Equilibrium` of an object that stays in its place. `balanced` is True, because no wrench was given.
     """
     pressure = gel.stiffness * jnp.clip(-heights, 0, gel.thickness)
     return Equilibrium(jnp.float32(0), jnp.zeros(2), pressure, jnp.bool_(True))

@@ -75,10 +75,10 @@ class Hand(AutomaticPerson):
         if self._now_s - self._since_s > self._patience_s or self._unseen == _UNSEEN:
             raise ValueError(
                 f"hardware.collect has shown the instruction `{view.instruction}` for "
-                f"{self._now_s - self._since_s:.1f} s (contact: {view.contact}, still: {view.still}). Number of "
-                f"successive held poses that showed no contact: {self._unseen}. The thresholds of hardware.collect do "
-                f"not suit the twin's images, or patience_s of Hand ({self._patience_s:g} s) is too short. Change the "
-                "argument config (a GuideConfig) of hardware.collect, or increase patience_s"
+                f"{self._now_s - self._since_s:.1f} s (contact: {view.contact}, still: {view.still}). The hand has "
+                f"tried {self._unseen} poses in a row in which no contact was found. The thresholds of "
+                f"hardware.collect do not suit the twin's images, or patience_s of Hand ({self._patience_s:g} s) is "
+                "too short. Change the argument config (a GuideConfig) of hardware.collect, or increase patience_s"
             )
 
     def action(self) -> Action | None:
