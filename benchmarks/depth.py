@@ -191,7 +191,7 @@ def measure(
 
 
 def describe(d: Difference) -> str:
-    """Format the differences as one row of the table."""
+    """Format the differences between two depth images as one row of the printed table."""
     rest = max(d.elsewhere, 1)
     return (
         f"{d.interior:9} {100 * (1 - d.interior_beyond_10um / max(d.interior, 1)):9.4f} {d.interior_beyond_100um:7} "

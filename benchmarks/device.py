@@ -88,7 +88,7 @@ class Measured(NamedTuple):
 
 
 def serve(link: multiprocessing.connection.Connection, path: Path, lag_s: float, twin: bool) -> None:
-    """Run the emulated devices in a process of their own, until the process that reads pairs has finished.
+    """Run the emulated devices in a process of their own, until the process that reads the images has finished.
 
     Args:
         link: Connection to the reading process. This function first sends the address of the camera. The reading

@@ -297,14 +297,15 @@ def difference(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
 
 
 def sides(case: Case, num: int) -> dict[str, np.ndarray]:
-    """Simulate a case on all sides that the docstring of the module lists.
+    """Simulate a case on all sides. A side is a way to compute the case, see the docstring of the module.
 
     Args:
         case: The case.
         num: Number of runs on each side.
 
     Returns:
-        The index of the label of every run, by name of the side. Our side, "ours", is the first.
+        A dictionary from the name of each side to the indices of the runs' labels in `case.labels`. The first side is
+        "ours".
     """
     other_hand = [objects.mirror(body) for body in case.bodies]
     rolled: dict[str, physics.Trajectory] = {}

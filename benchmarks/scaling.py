@@ -47,7 +47,7 @@ class Args:
 
 
 class Point(NamedTuple):
-    """The input modalities in the test of a trained model, and the amount of training of this model."""
+    """A point of the figure: the inputs of a tested model, the size of its training set, and its training time."""
 
     inputs: str
     trajectories: int  # of the training set

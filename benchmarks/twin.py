@@ -97,7 +97,7 @@ def served(size: tuple[int, int], number: int) -> float:
 
 
 def main(args: Args) -> None:
-    """Measure each image size in SIZES on one CPU core, and print a line for each size."""
+    """Print a line with the rates of the twin on one CPU core for each image size in SIZES."""
     core = min(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {core})
     for size in SIZES:

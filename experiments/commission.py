@@ -263,7 +263,8 @@ def claim_pictures(config: Config, camera: hardware.Camera) -> None:
     """Reserve the folder of live pictures for one camera, one image size and one printed board.
 
     Raises:
-        ValueError: The folder has pictures from another camera, of another size, or of a board with another `ruler`.
+        ValueError: The folder has pictures from another camera, of another size, or of another print of the board (the
+            option `--ruler`).
     """
     made = {"camera": camera.source, "width": config.width, "height": config.height, "ruler": config.ruler}
     storage.claim(config.out / "board" / "camera.json", made)

@@ -154,7 +154,7 @@ def opened(config: Config) -> Iterator[Source]:
 
 
 def replayed(config: Config) -> Source:
-    """Make the source of `--replay`. Without `--sensor`, the sensor file in the recording is used if there is one."""
+    """Open the recording that `--replay` selects. Without `--sensor`, its own sensor file is used if there is one."""
     first, file = config.replay[0], config.sensor
     path = first if len(config.replay) == 1 else (first, config.replay[1])
     sensor = hardware.Replay(path, speed=config.speed, loop=config.loop)

@@ -58,7 +58,7 @@ class Lights:
         return found, mean
 
     def off_after(self, time_s: float) -> float | None:
-        """Return the later of `time_s` and the time (s) at which the lights went off. None: the lights are on."""
+        """Return the time (s) since which the lights are off, but at least `time_s`. Return None if they are on now."""
         with self._lock:
             since_s, share = self._changes[-1]
         return max(since_s, time_s) if share == 0 else None

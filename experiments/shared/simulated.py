@@ -58,7 +58,7 @@ class Hand(twin.Hand):
         self._problem: str | None = None
 
     def show(self, view: View) -> None:
-        """Follow the instruction from `hardware.collect` in `view`, and show the number of confirmed trajectories.
+        """Move the object as `hardware.collect` instructs in `view`, and show the number of confirmed trajectories.
 
         If a problem has occurred since the last view, its message is shown too.
         """
@@ -72,7 +72,7 @@ class Hand(twin.Hand):
 
 
 def collect(config: Simulated) -> None:
-    """Collect trajectories until `config.count` are confirmed, or continue an interrupted collection.
+    """Collect trajectories of the twin until there are `config.count`, or continue an interrupted collection.
 
     The twin (`ObjectScene`) simulates a fixed sequence of trajectories for each seed. A recorded trajectory keeps its
     number in this sequence. A continued collection starts with the largest recorded number plus 1, so that no

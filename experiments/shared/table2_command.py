@@ -45,7 +45,7 @@ def learn(args: Train) -> None:
     Raises:
         ValueError: An option is out of range, there are too few trajectories, or the results were made with other
             options or trajectories.
-        FileNotFoundError: There is no sensor file, or a stage before `only` has not been run.
+        FileNotFoundError: There is no sensor file, or a stage before `args.only` has not been run.
         LockedError: Another process works on the same results.
         OSError: A file is damaged or cannot be written.
     """

@@ -90,10 +90,10 @@ def write_shard(
 
     Args:
         path: The `.array_record` file. The `.npz` file has the same path except for the suffix.
-        frames: Batches of images in the order in which they are stored. The batches of frames come first, and each of
-            them is a tuple `Images`. The batches of views come last, and each of them is a tuple with one array of n
-            visual images, uint8 `(n, height, width, 3)`. A view is a visual image of an object in an initial pose from
-            which no trajectory is simulated.
+        frames: Batches of images in the order in which they are stored. The first batches have frames of trajectories,
+            and each is a tuple `Images`. The last batches have views, and each is a tuple with one array of n visual
+            images, uint8 `(n, height, width, 3)`. A view is a visual image of an object in an initial pose from which
+            no trajectory is simulated.
         arrays: All other data, one array for each name in `records.ARRAYS`.
         identity: The identity of the shard, which `read_shard` checks.
 

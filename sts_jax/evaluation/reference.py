@@ -1,4 +1,4 @@
-"""The baselines, which predict without a trained model, and the names of all rows in tables that are no models."""
+"""The baselines, which predict without a trained model, and the names of the tables' rows without a model."""
 
 import numpy as np
 

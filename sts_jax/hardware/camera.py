@@ -106,7 +106,7 @@ class Camera:
         grabber, self._grabber = self._grabber, None
         if grabber is not None and not grabber.stop():
             warnings.warn(
-                f"the driver of {self.config.name} does not respond. The camera is closed as soon as the driver "
+                f"the driver of {self.config.name} does not respond. The camera will be closed when the driver "
                 "responds.",
                 stacklevel=2,
             )

@@ -145,10 +145,10 @@ class Device:
         return self.exposure_visual, self.exposure_tactile
 
     def camera_config(self, source: str | None = None) -> CameraConfig:
-        """Return the camera configuration that this `Device` describes, with the exposure of the visual stream.
+        """Return the camera configuration that this `Device` describes, with the exposure for visual images.
 
-        If the source is a stream or a video file, the configuration contains only the image size and the frame rate,
-        and `lock` is False.
+        If the source is a network stream or a video file, the configuration contains only the image size and the frame
+        rate, and `lock` is False.
 
         Args:
             source: Another path or URL of the same camera, such as its URL with a password. None: the path or URL in

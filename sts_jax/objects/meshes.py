@@ -335,8 +335,8 @@ def _body(
             )
         if holds:
             warnings.warn(
-                f"{path}: the mesh {fault}. The interior of the hollow object, which its contents can fill, is "
-                f"therefore the convex hull of the mesh ({hull.volume * 1e6:.3g} ml)",
+                f"{path}: the mesh {fault}. The contents of the object can therefore fill the whole convex hull of "
+                f"the mesh ({hull.volume * 1e6:.3g} ml)",
                 stacklevel=3,
             )
         if len(hull.simplices) > max(len(faces), len(vertices)):  # keeps the body in its size class

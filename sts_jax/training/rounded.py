@@ -2,8 +2,8 @@
 
 A weight w of a kernel is stored as an integer q, with `w = q s`. Each output channel has its own step s: the root mean
 square of the channel's weights, divided by 128. The step is larger if q would not fit into 16 bits. A weight changes by
-at most half a step. A compressed weight takes about 1.2 bytes, compared with 1.9 bytes in half precision. Vectors, such
-as biases, are stored unchanged.
+at most half a step. In the compressed file, a weight takes about 1.2 bytes. In half precision, it would take 1.9 bytes.
+Vectors, such as biases, are stored unchanged.
 """
 
 import io

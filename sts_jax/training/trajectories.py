@@ -70,7 +70,7 @@ def image_arrays(
     """
     found, shape = {"visual": visual, "tactile": tactile}, (2, *preprocessing.resolution, 3)
     if not modalities or not set(modalities) <= set(found):
-        raise ValueError(f"modalities must be one or both of {', '.join(found)}, got {modalities}")
+        raise ValueError(f"modalities must be {' or '.join(map(repr, found))} or both, got {modalities}")
     for name, images in found.items():
         if images.dtype != np.uint8 or images.shape != (len(visual), *shape) or not len(images):
             raise ValueError(

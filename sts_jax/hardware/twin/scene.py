@@ -139,7 +139,7 @@ class Picture(Scene):
         return Seen(Phase.STILL, 0, 0, None)
 
     def ends(self, seen: Seen, blender: Blender) -> Ends:
-        """Return the two images that were passed to `Picture`, converted by the method `Blender.ends`.
+        """Return the two images that were passed to `Picture`, in linear light and distorted by the lens.
 
         See `Scene.ends` for the arguments. The images do not depend on `seen`.
         """
