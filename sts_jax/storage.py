@@ -125,13 +125,13 @@ def read_arrays(path: Path, remedy: str) -> dict[str, np.ndarray]:
 
     Raises:
         FileNotFoundError: The file does not exist.
+        OSError: The file cannot be read, for example because of its permissions.
         DamagedFileError: The file is not a complete `.npz` file.
     """
+    data = path.read_bytes()
     try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as arrays:
+        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             return dict(arrays)
-    except FileNotFoundError:
-        raise
     except Exception as error:  # np.load raises errors of five types for damaged files
         raise DamagedFileError(f"{path} is damaged ({error}): {remedy}.") from error
 
