@@ -297,6 +297,31 @@ def test_a_silent_controller_gives_a_timeout_and_works_again_later(peer):
         assert leds.set(ON).levels == ON
 
 
+def test_a_write_that_pyserial_calls_late_is_no_error_if_the_answer_arrives(peer, monkeypatch):
+    write = serial.Serial.write
+
+    def late(self, data):  # pyserial behaves so if the process is suspended between the system call and the clock
+        write(self, data)
+        raise serial.SerialTimeoutException("Write timeout")
+
+    with connect(peer.path) as leds:
+        monkeypatch.setattr(serial.Serial, "write", late)
+        assert leds.set(ON).levels == ON
+
+
+def test_a_port_that_accepts_no_bytes_is_named(peer, monkeypatch):
+    def full(self, data):
+        raise serial.SerialTimeoutException("Write timeout")
+
+    with connect(peer.path, answer_s=0.3) as leds:
+        with monkeypatch.context() as patch:
+            patch.setattr(serial.Serial, "write", full)
+            with pytest.raises(hardware.LedTimeoutError, match=r"port .* accepted no bytes for 0\.3 s\. Unplug"):
+                leds.set(ON)
+        leds._answer_s = 20.0
+        assert leds.set(ON).levels == ON
+
+
 @pytest.mark.parametrize("levels", [(1, 2, 3), (0, 0, 0, 256), (0, 0, 0, -1), (0, 0, 0, 1, 2)])
 def test_bad_levels_are_named(peer, levels):
     with connect(peer.path) as leds, pytest.raises(ValueError, match="levels must be 4 integers"):

@@ -96,8 +96,9 @@ class Connection:
             self._heard = b""
             sent_s = time.monotonic()
             deadline = sent_s + timeout_s
+            accepted = False
             while (now := time.monotonic()) < deadline:
-                self._write(line)
+                accepted |= self._write(line)
                 until = min(deadline, now + REPEAT_S)
                 while (reply := self._next_reply(until)) is not None:
                     if isinstance(reply, protocol.Refused) and reply.sequence in (0, self._sequence):
@@ -107,6 +108,11 @@ class Connection:
                     if isinstance(reply, answer) and reply.sequence == self._sequence:
                         self.answered_s = time.monotonic()
                         return reply, sent_s, self.answered_s
+            if not accepted:
+                raise ports.LedTimeoutError(
+                    f"the port {self.name} accepted no bytes for {timeout_s:g} s. Unplug the LED controller and plug "
+                    "it in again."
+                )
             raise ports.LedTimeoutError(
                 f"the LED controller on {self.name} gave no valid answer to the request "
                 f"{line.decode().strip()!r} within {timeout_s:g} s. {self._description()}"
@@ -165,16 +171,19 @@ class Connection:
         except (OSError, TypeError) as error:  # TypeError: pyserial reads from a port that was closed meanwhile
             raise self._vanished(error) from error
 
-    def _write(self, line: bytes) -> None:
+    def _write(self, line: bytes) -> bool:
+        """Write a line. Return False if the time `ports.WRITE_S` has passed.
+
+        On a computer with other work, pyserial reports this also for a line that it has sent, if the operating system
+        suspended the process meanwhile.
+        """
         try:
             self._serial.write(line)
-        except serial.SerialTimeoutException as error:
-            raise ports.LedTimeoutError(
-                f"the port {self.name} accepted no bytes for {ports.WRITE_S:g} s. Unplug the LED controller and plug "
-                "it in again."
-            ) from error
+        except serial.SerialTimeoutException:
+            return False
         except (OSError, TypeError) as error:
             raise self._vanished(error) from error
+        return True
 
     def _vanished(self, error: Exception) -> ports.DisconnectedError:
         return ports.DisconnectedError(
