@@ -17,6 +17,7 @@ import time
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple, TypeVar
 
+import jax
 import numpy as np
 import tyro
 
@@ -57,7 +58,9 @@ class Point(NamedTuple):
 
 def some(part: Part, objects: np.ndarray) -> Part:
     """Select the items that show one of the given objects."""
-    return type(part)(*(leaf[np.isin(part.object, objects)] for leaf in part))
+    rows = np.isin(part.object, objects)
+    chosen: Part = jax.tree.map(lambda leaf: leaf[rows], part)
+    return chosen
 
 
 def train(

@@ -36,12 +36,6 @@ from experiments.shared.own_twin import own_twin
 from experiments.shared.progress import say
 from sts_jax import hardware
 
-SCENARIOS: dict[str, type[sts.physics.Scenario]] = {
-    "freefall": sts.physics.Freefall,
-    "inclined": sts.physics.Inclined,
-    "perturbed": sts.physics.Perturbed,
-    "released": sts.physics.Released,
-}
 PRINT_S = 1.0  # time between two lines in the terminal (s)
 
 
@@ -57,8 +51,6 @@ class Config:
 
     # name of a model of the library (released, inclined, freefall or perturbed), or the folder of another model
     model: str = "released"
-    # scenario of the model if --model is a folder. It determines the names of the predicted outcomes
-    scenario: Literal["freefall", "inclined", "perturbed", "released"] | None = None
     # known quantities of the scenario that the model receives (SI units), such as the acceleration (x, y) and the
     # duration for perturbed. Empty: zeros
     condition: tuple[float, ...] = ()
@@ -274,13 +266,11 @@ def follow(config: Config, source: Source, predictor: sts.Predictor, page: LiveP
 
     The command shows the images, predicts from the newest images, and records the images if `--record` is given.
     """
-    name = config.scenario or (config.model if config.model in SCENARIOS else None)
-    outcomes = () if name is None else tuple(str(outcome) for outcome in SCENARIOS[name].outcomes)
     with source.sensor as sensor, contextlib.ExitStack() as stack:
         prepared = views(config, source, next(images(config, source)))
         screen = Screen(config, source, prepared, page)
         stack.callback(screen.close)
-        live = stack.enter_context(Live(predictor, prepared, outcomes, config.condition, screen.update))
+        live = stack.enter_context(Live(predictor, prepared, config.condition, screen.update))
         screen.live = live
         recorder = None
         if isinstance(sensor, hardware.Replay):

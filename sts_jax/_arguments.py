@@ -3,7 +3,7 @@
 import operator
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -64,8 +64,8 @@ def checked_masks(
     """Check the argument `present` of a `Predictor`, and return its masks as Boolean arrays.
 
     Args:
-        present: Dictionary from the name of a modality ("visual", "tactile" or "pose") to a Boolean mask of the items
-            in the batch. None for no masks.
+        present: Dictionary from the name of a modality, such as "tactile", to a Boolean mask of the items in the batch.
+            None for no masks.
         arrays: Dictionary from the name of a modality to its input. It contains only the inputs that were given.
         lead: Sizes of the leading axes that all inputs have. Each mask must have this shape.
 
@@ -101,6 +101,28 @@ def checked_masks(
     return masks
 
 
+def checked_measurements(measurements: Any, reserved: tuple[str, ...]) -> dict[str, Any]:
+    """Check the argument `measurements` of a `Predictor`, and return its entries that are not None.
+
+    Args:
+        measurements: Dictionary from the name of a further modality to its values. None for no values.
+        reserved: Names of the modalities that have an argument of their own.
+
+    Raises:
+        ValueError: `measurements` is not a dictionary, or has a name in `reserved`.
+    """
+    if not isinstance(measurements, Mapping | None):
+        raise ValueError(
+            f"measurements is a {type(measurements).__name__}, but it must be a dict of arrays, such as "
+            "measurements={'wrench': wrench}."
+        )
+    own = {name: value for name, value in (measurements or {}).items() if value is not None}
+    for name in reserved:
+        if name in own:
+            raise ValueError(f"measurements has the name {name!r}: pass the argument {name} instead.")
+    return own
+
+
 def checked_samples(num_samples: Any, key: Any) -> int:
     """Check the number of samples and the random key that draws them, and return the number.
 
@@ -130,32 +152,39 @@ def checked_samples(num_samples: Any, key: Any) -> int:
     return number
 
 
-def plausible(name: str, array: Float[Array, "..."]) -> Bool[Array, "*n"]:
+Kind = Literal["image", "pose", "vector"]  # the kinds of inputs, which have different ranges
+
+
+def plausible(kind: Kind, array: Float[Array, "..."]) -> Bool[Array, "*n"]:
     """Find the items of a batch whose numbers are in range. The array may be traced.
 
     The numbers of an image must be in [0, 1]. A pose must have coordinates of at most 10 m in magnitude and a
-    quaternion of length 1, with a tolerance of 0.01.
+    quaternion of length 1, with a tolerance of 0.01. The numbers of a vector must be finite.
 
     Args:
-        name: Name of the modality. All modalities but "pose" are images.
-        array: Images (*n, height, width, 3), or poses (*n, 7): position (m) and unit quaternion. There may be any
-            number of leading axes *n.
+        kind: Kind of the input.
+        array: Images (*n, height, width, channels), poses (*n, 7): position (m) and unit quaternion, or vectors
+            (*n, size). There may be any number of leading axes *n.
 
     Returns:
         Mask of the items in range.
     """
-    if name == "pose":
+    if kind == "vector":
+        return jnp.isfinite(array).all(-1)
+    if kind == "pose":
         lengths = jnp.linalg.norm(jax.lax.stop_gradient(array[..., 3:]), axis=-1)
         return (jnp.abs(lengths - 1) <= _QUAT_TOLERANCE) & (jnp.abs(array[..., :3]) <= _FARTHEST).all(-1)
     return ((array >= 0) & (array <= 1)).all((-3, -2, -1))
 
 
-def check_values(name: str, array: np.ndarray) -> None:
-    """Check that all images or all poses of an input have finite numbers in the allowed range.
+def check_values(name: str, kind: Kind, array: np.ndarray) -> None:
+    """Check that all items of an input have finite numbers in the allowed range.
 
     Args:
-        name: Name of the modality. All modalities but "pose" are images.
-        array: Images (..., height, width, 3), or poses (..., 7): position (m) and unit quaternion.
+        name: Name of the modality, for error messages.
+        kind: Kind of the input.
+        array: Images (..., height, width, channels), poses (..., 7): position (m) and unit quaternion, or vectors
+            (..., size).
 
     Raises:
         ValueError: A number is NaN or infinite, an image has values outside [0, 1], a quaternion's length is not 1
@@ -166,7 +195,9 @@ def check_values(name: str, array: np.ndarray) -> None:
             f"{name} has NaN or infinite values. Exclude the items with such values: pass present={{{name!r}: mask}}, "
             "where mask is False for these items."
         )
-    if name == "pose":
+    if kind == "vector":
+        return
+    if kind == "pose":
         lengths = np.linalg.norm(array[..., 3:].astype(np.float64), axis=-1)  # squares of 1e30 are beyond float32
         if lengths.size and np.abs(lengths - 1).max() > _QUAT_TOLERANCE:
             raise ValueError(

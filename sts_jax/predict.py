@@ -23,8 +23,8 @@ _LARGEST_CONDITION = 100.0  # largest condition, as a multiple of its usual magn
 class Predictor:
     """A trained model as a function: `predictor(visual=image)` returns a `Prediction`.
 
-    The inputs are images and the object's pose in the first frame of a trajectory. The prediction is the last frame, in
-    which the object has come to rest.
+    The inputs are images and the object's pose in the first frame of a trajectory, and the further modalities of models
+    that have them (`dataset.Measurement`). The prediction is the last frame, in which the object has come to rest.
 
     `Predictor.load("freefall")` loads a model that comes with the library.
     `Predictor.load("runs/freefall/models/statespace")` loads a model that you trained. Calls are pure, and work inside
@@ -56,6 +56,14 @@ class Predictor:
         config = model.config
         self._inputs = config.names if isinstance(config, mvae.Config) else config.inputs
         self._names = config.names if isinstance(config, mvae.Config) else MODALITIES
+        size = (*preprocessing.resolution, 3)
+        # the kind and the shape of one item, for each input
+        self._kinds: dict[str, _arguments.Kind] = {"visual": "image", "tactile": "image", "pose": "pose"}
+        self._shapes: dict[str, tuple[int, ...]] = {"visual": size, "tactile": size, "pose": (7,)}
+        if isinstance(config, mvae.Config):
+            for modality in config.modalities:
+                self._kinds.setdefault(modality.name, modality.kind)
+                self._shapes.setdefault(modality.name, modality.shape)
 
     @classmethod
     def load(
@@ -151,14 +159,15 @@ class Predictor:
         pose: ArrayLike | None = None,
         condition: ArrayLike | None = None,
         state: ArrayLike | None = None,
+        measurements: dict[str, ArrayLike] | None = None,
         present: dict[str, ArrayLike] | None = None,
         key: PRNGKeyArray | None = None,
         num_samples: int = 0,
     ) -> Prediction:
         """Predict the last frame of trajectories from their first frames.
 
-        Pass at least one of `visual`, `tactile` and `pose`. All arrays are floating-point and have the same leading
-        axes *n: none for a single item, and any number for a batch.
+        Pass at least one of `visual`, `tactile`, `pose` and `measurements`. All arrays are floating-point and have the
+        same leading axes *n: none for a single item, and any number for a batch.
 
         Outside `jax.jit`, an invalid value raises an error. Traced values cannot raise errors: an item with an invalid
         traced value gives a prediction of NaN. Other items of the batch are not affected.
@@ -173,6 +182,8 @@ class Predictor:
             state: Codes of the true pose, shape and mass, (*n, code), from `statespace.encode`. Only for state-space
                 models. With the true state of a simulation, the remaining error is that of the learned physics and of
                 the decoder.
+            measurements: Further modalities of the model by name, see `dataset.Measurement`: vectors of numbers in SI
+                units, (*n, size), or images in [0, 1], (*n, height, width, channels).
             present: Dictionary from the name of a modality to a Boolean mask (*n,), False for items in which the
                 modality is to be ignored. Ignored values may be NaN. By default, all items are used.
             key: Random key that draws the samples. It is needed only if `num_samples` > 0.
@@ -186,13 +197,13 @@ class Predictor:
             ValueError: No input is given, the model does not accept an input or was trained without it, or a value has
                 a wrong type or shape, is out of range, or is NaN. The message names the argument and the remedy.
         """
-        given = {
-            name: value for name, value in zip(MODALITIES, (visual, tactile, pose), strict=True) if value is not None
-        }
+        own = _arguments.checked_measurements(measurements, MODALITIES)
+        every = {"visual": visual, "tactile": tactile, "pose": pose, **own}
+        given = {name: value for name, value in every.items() if value is not None}
         if not given:
             raise ValueError(f"nothing to predict from: give at least one of {', '.join(self.modalities)}.")
         arrays = {name: self._checked_name(name, value) for name, value in given.items()}
-        leads = {name: array.shape[: -1 if name == "pose" else -3] for name, array in arrays.items()}
+        leads = {name: array.shape[: array.ndim - len(self._shapes[name])] for name, array in arrays.items()}
         lead = next(iter(leads.values()))
         if len(set(leads.values())) > 1:
             raise ValueError(f"the leading axes differ: {leads}. Pass arrays with the same leading axes.")
@@ -201,11 +212,11 @@ class Predictor:
         for name, array in arrays.items():
             mask = masks.get(name)
             if _arguments.traced(array) or _arguments.traced(mask):
-                fine = _arguments.plausible(name, jnp.asarray(array))
+                fine = _arguments.plausible(self._kinds[name], jnp.asarray(array))
                 fine = fine if mask is None else fine | ~mask
                 valid = fine if valid is None else valid & fine
             else:
-                _arguments.check_values(name, np.asarray(array if mask is None else array[mask]))
+                _arguments.check_values(name, self._kinds[name], np.asarray(array if mask is None else array[mask]))
         if state is not None:
             arrays["state"] = self._checked_state(state, lead)
         condition, plausible = self._checked_condition(condition, lead)
@@ -281,11 +292,20 @@ class Predictor:
 
     @property
     def modalities(self) -> tuple[str, ...]:
-        """Names of the inputs that the model accepts, out of "visual", "tactile" and "pose".
+        """Names of the inputs that the model accepts: some of "visual", "tactile" and "pose", and further modalities.
 
         The model accepts an input only if the first frame of at least one training trajectory contains this input.
         """
         return tuple(name for name in self._inputs if name not in self.preprocessing.absent)
+
+    @property
+    def outcomes(self) -> tuple[str, ...]:
+        """Names of the outcomes in the order of `Prediction.outcome_probability`, such as ("rests", "fell off").
+
+        Empty for `mvae` models, and for state-space models of older versions, which do not store the names.
+        """
+        config = self.model.config
+        return config.outcome_names if isinstance(config, statespace.Config) else ()
 
     @property
     def empty(self) -> dict[str, np.ndarray]:
@@ -305,18 +325,17 @@ class Predictor:
                 f"data (before a fall, for example, nothing touches the pad). Leave out the argument {name}, or use a "
                 "model of another scenario."
             )
-        array = _arguments.checked_array(name, value, "7 numbers" if name == "pose" else "floats in [0, 1]")
+        tail, is_image = self._shapes[name], self._kinds[name] == "image"
+        array = _arguments.checked_array(name, value, "floats in [0, 1]" if is_image else f"{tail[0]} numbers")
         if not jnp.issubdtype(array.dtype, jnp.floating):
             raise ValueError(
                 f"{name} is {array.dtype}, but it must be floating-point"
-                + ("." if name == "pose" else " in [0, 1]: divide uint8 images by 255.")
+                + (" in [0, 1]: divide uint8 images by 255." if is_image else ".")
             )
-        height, width = self.preprocessing.resolution
-        tail = (7,) if name == "pose" else (height, width, 3)
         if array.ndim < len(tail) or array.shape[array.ndim - len(tail) :] != tail:
             raise ValueError(
                 f"{name} has shape {array.shape}, but {self.name} needs shape (..., {', '.join(map(str, tail))})"
-                + ("." if name == "pose" else f": render with resolution={self.preprocessing.resolution}.")
+                + (f": render with resolution={tail[:2]}." if is_image else ".")
             )
         if math.prod(array.shape) == 0:
             raise ValueError(f"{name} has shape {array.shape}, which contains no item: pass at least one item.")

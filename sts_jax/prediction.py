@@ -34,13 +34,17 @@ class Prediction(NamedTuple):
     log_var: Float[Array, "*n latent"]
     # Samples, None if `num_samples` is 0. Their images and poses have another leading axis of `num_samples`.
     samples: "Prediction | None" = None
-    # Probability of each of the scenario's `outcomes`, in their order. None for an `mvae` model.
+    # Probability of each of the scenario's outcomes, in the order of `Predictor.outcomes`. None for an `mvae` model.
     outcome_probability: Float[Array, "*n outcomes"] | None = None
+    # Further modalities (`dataset.Measurement`) by name: numbers in SI units, or images in [0, 1].
+    measurements: dict[str, Float[Array, "..."]] | None = None
 
     def __repr__(self) -> str:
+        leaves = {name: leaf for name, leaf in self._asdict().items() if name != "measurements"}
+        leaves |= self.measurements or {}
         shapes = (
             f"{name}={leaf.dtype}{list(leaf.shape)}" if isinstance(leaf, jax.Array | np.ndarray) else f"{name}={leaf!r}"
-            for name, leaf in zip(self._fields, self, strict=True)
+            for name, leaf in leaves.items()
         )
         return f"Prediction({', '.join(shapes)})"
 
@@ -69,7 +73,8 @@ def predict(
         preprocessing: Preprocessing with which the model was trained.
         blank: Tactile image of the untouched sensor in [0, 1].
         inputs: Inputs by the name of the modality. "visual" and "tactile" are images in [0, 1], (*n, height, width, 3).
-            "pose" is a position (m) and a unit quaternion, (*n, 7). Any of these may be missing.
+            "pose" is a position (m) and a unit quaternion, (*n, 7). Further modalities are vectors of numbers in SI
+            units, (*n, size), or images in [0, 1]. Any of these may be missing.
         present: Masks (*n,) by the name of the modality. False means that the input of this modality is ignored for
             this item of the batch. A modality without a mask is used for all items. Tactile images without contact are
             always ignored, unless the model was trained with blank tactile images as inputs.
@@ -83,8 +88,9 @@ def predict(
         The prediction for each item.
     """
     lead = shape
+    vectors = ("pose", *dict(preprocessing.scales))
     for name, value in inputs.items():
-        lead = value.shape[: -1 if name == "pose" else -3]
+        lead = value.shape[: -1 if name in vectors else -3]
     flat, counts = _flat(preprocessing, inputs, present, lead, blank)
     if flat:
         posterior = mvae.infer(graphdef, state, flat, present=counts)
@@ -98,12 +104,14 @@ def predict(
         wide = None if condition is None else jnp.broadcast_to(condition, (*z.shape[:-1], condition.shape[-1]))
         out = mvae.decode(graphdef, state, z, condition=wide)
         out = {name: value.reshape(*shape, *value.shape[z.ndim - 1 :]) for name, value in out.items()}
+        found = {name: preprocessing.decode(name, value) for name, value in out.items()}
         return Prediction(
-            visual=jax.nn.sigmoid(out["visual"]) if "visual" in out else None,
-            tactile=jax.nn.sigmoid(out["tactile"]) if "tactile" in out else None,
-            pose=preprocessing.decode_pose(out["pose"]) if "pose" in out else None,
+            visual=found.pop("visual", None),
+            tactile=found.pop("tactile", None),
+            pose=found.pop("pose", None),
             mean=posterior.mean.reshape(*lead, -1),
             log_var=posterior.log_var.reshape(*lead, -1),
+            measurements=found or None,
         )
 
     result = decode(posterior.mean, lead)
@@ -240,10 +248,10 @@ def _flat(
     lead: tuple[int, ...],
     blank: Float[Array, "h w 3"],
 ) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Encode poses, and return all inputs and their masks with one leading axis. Touches without contact are masked."""
+    """Encode all inputs, and return them and their masks with one leading axis. Touches without contact are masked."""
     flat, counts = {}, {}
     for name, value in inputs.items():
-        value = preprocessing.encode_pose(value) if name == "pose" else value
+        value = preprocessing.encode(name, value)
         flat[name] = value.reshape(-1, *value.shape[len(lead) :])
         counts[name] = present.get(name, jnp.ones(lead, bool)).reshape(-1)
     if "tactile" in flat:
@@ -251,8 +259,17 @@ def _flat(
     return flat, counts
 
 
-def flagged(prediction: Prediction, valid: Bool[Array, "*n"]) -> Prediction:
-    """Set all numbers of the invalid items of a prediction to NaN. The mask `valid` is False for these items."""
+def flagged(prediction: Prediction, valid: Bool[Array, "*n"], *, leading: int = 0) -> Prediction:
+    """Set all numbers of the invalid items of a prediction to NaN.
+
+    Args:
+        prediction: Prediction, or the samples of a prediction.
+        valid: Mask that is False for the invalid items.
+        leading: Number of axes of the images, poses and measurements before the axes `*n`: 1 for samples, else 0.
+
+    Returns:
+        The prediction with NaN in the invalid items.
+    """
 
     def flag(leaf: Array, axes: int) -> Array:
         return jnp.where(valid.reshape(*valid.shape, *(1,) * axes), leaf, jnp.nan)
@@ -264,6 +281,7 @@ def flagged(prediction: Prediction, valid: Bool[Array, "*n"]) -> Prediction:
         pose=jax.tree.map(numbers, prediction.pose),
         mean=numbers(prediction.mean),
         log_var=numbers(prediction.log_var),
-        samples=None if prediction.samples is None else flagged(prediction.samples, valid),
+        samples=None if prediction.samples is None else flagged(prediction.samples, valid, leading=1),
         outcome_probability=jax.tree.map(numbers, prediction.outcome_probability),
+        measurements=jax.tree.map(lambda leaf: flag(leaf, leaf.ndim - valid.ndim - leading), prediction.measurements),
     )

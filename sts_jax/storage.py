@@ -136,14 +136,17 @@ def read_arrays(path: Path, remedy: str) -> dict[str, np.ndarray]:
         raise DamagedFileError(f"{path} is damaged ({error}): {remedy}.") from error
 
 
-def claim(path: Path, content: dict) -> None:
+def claim(path: Path, content: dict, *, labels: tuple[str, ...] = ()) -> None:
     """Record settings in a JSON file, or check that an existing file has the same settings.
 
-    The check ensures that all results in a folder have the same settings.
+    The check ensures that all results in a folder have the same settings. A field that the existing file lacks, because
+    an older version wrote it, counts as empty.
 
     Args:
         path: The file.
         content: The settings, of JSON types. Tuples count as lists.
+        labels: Dotted names of fields that an existing file may lack, such as `model.outcome_names`, because they do
+            not influence the results.
 
     Raises:
         ValueError: The settings in the existing file differ. The message names all fields that differ, and the remedy.
@@ -156,7 +159,7 @@ def claim(path: Path, content: dict) -> None:
         write_json(path, content)
         return
     there = read_json(path, f"delete {path.parent}, or choose another folder")
-    found = list(_differences(there, content))
+    found = [change for change in _differences(there, content) if not (change[0] in labels and change[1] is None)]
     if found:
         made = ", ".join(f"{field or 'content'} = {old!r}" for field, old, _ in found[:_SHOWN])
         asked = ", ".join(f"{field or 'content'} = {new!r}" for field, _, new in found[:_SHOWN])
@@ -173,7 +176,7 @@ _SHOWN = 3  # number of differing fields whose values a message contains
 def _differences(old: object, new: object, field: str = "") -> Iterator[tuple[str, object, object]]:
     """Yield each field in which two contents differ: its dotted name, the old value and the new value."""
     if isinstance(old, dict) and isinstance(new, dict):
-        for key in [*old, *(key for key in new if key not in old)]:
+        for key in [*old, *(key for key in new if key not in old and new[key] not in ([], {}))]:
             yield from _differences(old.get(key), new.get(key), f"{field}.{key}".lstrip("."))
     elif old != new:
         yield field, old, new

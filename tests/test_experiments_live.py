@@ -36,7 +36,8 @@ def views(divided=True):
 class StubPredictor:
     """Predicts the image that it was given, mirrored, and keeps all inputs."""
 
-    def __init__(self, seconds=0.0, modalities=("visual", "tactile"), condition=0):
+    def __init__(self, seconds=0.0, modalities=("visual", "tactile"), condition=0, outcomes=("rests", "fell off")):
+        self.outcomes = outcomes
         self.modalities, self.seconds, self.calls = modalities, seconds, []
         self.preprocessing = SimpleNamespace(resolution=(16, 16))
         self.empty = {"visual": np.full((16, 16, 3), 0.6, np.float32), "tactile": np.full((16, 16, 3), 0.7, np.float32)}
@@ -61,7 +62,7 @@ def pair(visual=None, tactile=None, number=0):
 def predicted(predictor, *shots, **options):
     """The prediction from one pair."""
     done = threading.Event()
-    with Live(predictor, views(), ("rests", "fell off"), (), done.set, **options) as running:
+    with Live(predictor, views(), (), done.set, **options) as running:
         running.offer(*shots)
         assert done.wait(WAIT_S)
         return running.newest
@@ -100,8 +101,8 @@ def test_contact_and_occupation(visual, tactile, contact, occupied):
 
 
 def test_without_a_sensor_file_contact_is_unknown():
-    done, predictor = threading.Event(), StubPredictor(modalities=("visual",))
-    with Live(predictor, Views(LENS, PINHOLE, None), (), (), done.set) as running:
+    done, predictor = threading.Event(), StubPredictor(modalities=("visual",), outcomes=())
+    with Live(predictor, Views(LENS, PINHOLE, None), (), done.set) as running:
         running.offer(*pair())
         assert done.wait(WAIT_S)
         found = running.newest
@@ -124,7 +125,7 @@ def test_images_are_dropped_and_never_queued():
             return real(self, **inputs)
 
     predictor = Slow()
-    with Live(predictor, views(), ("rests", "fell off"), (), shown.release) as running:
+    with Live(predictor, views(), (), shown.release) as running:
         running.offer(*pair(grey(100)))
         assert started.acquire(timeout=WAIT_S)
         for level in range(110, 120):
@@ -144,7 +145,7 @@ def test_an_error_of_the_thread_reaches_the_caller():
                 raise RuntimeError("broken")
             return super().__call__(**inputs)
 
-    with Live(Broken(), views(), (), (), lambda: None) as running:
+    with Live(Broken(), views(), (), lambda: None) as running:
         running.offer(*pair())
         running._thread.join(WAIT_S)
         with pytest.raises(RuntimeError, match="broken"):
@@ -153,9 +154,9 @@ def test_an_error_of_the_thread_reaches_the_caller():
 
 def test_unfit_models_are_refused():
     with pytest.raises(ValueError, match="takes no visual images"):
-        Live(StubPredictor(modalities=("tactile",)), views(), (), (), lambda: None)
+        Live(StubPredictor(modalities=("tactile",)), views(), (), lambda: None)
     with pytest.raises(ValueError, match=r"values of --condition must be 3, got 2: .* leave it out"):
-        Live(StubPredictor(condition=3), views(), (), (1.0, 2.0), lambda: None)
+        Live(StubPredictor(condition=3), views(), (1.0, 2.0), lambda: None)
 
 
 def seen(level=90, **changes):

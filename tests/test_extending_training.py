@@ -1,4 +1,4 @@
-"""Another loss, optimiser, logger and modality, from outside the library, as `docs/extending.md` shows."""
+"""Another loss, optimiser, logger and modality, from outside the library, in a training and in a whole experiment."""
 
 import json
 import struct
@@ -197,19 +197,6 @@ def test_the_code_of_the_page_trains_with_a_penalty_and_another_optimiser_and_wr
     assert "penalty" not in logged[0]
     wanted = {(name, record["step"]) for record in logged for name in record if name != "step"}
     assert scalars(tmp_path / "tensorboard" / "logged") == wanted
-
-
-@pytest.mark.slow
-def test_the_code_of_the_page_trains_a_model_of_pose_and_sound(tmp_path, monkeypatch):
-    """The last pose follows from the sound, so the prediction from sound is better than the mean pose."""
-    monkeypatch.chdir(tmp_path)
-    rng = np.random.default_rng(0)
-    sound = rng.uniform(-1, 1, (64, 16)).astype(np.float32)
-    pose = rng.uniform(-1, 1, (64, 12)).astype(np.float32)
-    names = {"pose": pose, "sound": sound, "pose_after": sound[:, :12], "sound_after": sound}
-    exec("\n".join(blocks("A further modality")), names)
-    error = np.mean((np.asarray(names["predicted"]["pose"]) - sound[:8, :12]) ** 2)
-    assert error < 0.5 * np.mean((sound[:8, :12] - sound[:, :12].mean(0)) ** 2)
 
 
 @pytest.mark.slow

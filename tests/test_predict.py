@@ -578,4 +578,8 @@ def test_each_model_of_the_library_predicts_from_vision(name, tmp_path, monkeypa
     out = predictor(visual=visual, condition=condition if condition.size else None)
     size = predictor.model.config.image_size
     assert out.visual.shape == out.tactile.shape == (size, size, 3)
+    scenario = getattr(sts.physics, name.capitalize())()
+    assert predictor.outcomes == tuple(scenario.named(int(outcome)) for outcome in scenario.outcomes)
+    assert out.outcome_probability.shape == (len(predictor.outcomes),)
+    assert predictor.model.calibration is not None
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(out))

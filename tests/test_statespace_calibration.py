@@ -1,5 +1,6 @@
 """Calibration of the final pose's density: closed forms, subsets of the inputs, and the file in a model's folder."""
 
+import dataclasses
 import json
 import shutil
 
@@ -253,3 +254,17 @@ def test_only_state_space_models_are_calibrated(tmp_path):
     training.train(training.TrainConfig(steps=1, batch_size=8), small, given, workdir=tmp_path)
     with pytest.raises(ValueError, match="kind mvae"):
         training.calibrate(tmp_path, given)
+
+
+@pytest.mark.slow
+def test_a_model_of_an_older_version_without_names_of_outcomes_is_resumed_and_named_ones_are_not_mixed(tmp_path):
+    named = dataclasses.replace(STATE, outcome_names=("rests", "rolls", "fell off"))
+    config = training.TrainConfig(steps=1, batch_size=8)
+    trained = training.train(config, STATE, arrays(), workdir=tmp_path)
+    again = training.train(config, named, arrays(), workdir=tmp_path)
+    assert (again.step, again.config) == (1, STATE)
+    for a, b in zip(jax.tree.leaves(trained.state), jax.tree.leaves(again.state), strict=True):
+        np.testing.assert_array_equal(a, b)
+    training.train(config, named, arrays(), workdir=tmp_path / "named")
+    with pytest.raises(ValueError, match=r"model\.outcome_names = \['rests', 'rolls', 'fell off'\]"):
+        training.train(config, STATE, arrays(), workdir=tmp_path / "named")

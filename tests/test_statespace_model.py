@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import json
 from typing import NamedTuple
 
 import jax
@@ -485,6 +486,7 @@ def test_rigid_finds_the_nearest_rotation():
         ({"encoder": (4, 4)}, "encoder has 2 widths and decoder has 3, but each must have 3"),
         ({"condition": 1}, r"condition is 1 and vectors is 1, but condition .* must be 0, or at least 2 \* vectors"),
         ({"drawn_first": 0.0}, r"drawn_first is 0\.0"),
+        ({"outcome_names": ("rests",)}, r"outcome_names has 1 names \('rests',\), but outcomes is"),
     ],
 )
 def test_config_rejects_values_out_of_range(change, message):
@@ -492,3 +494,6 @@ def test_config_rejects_values_out_of_range(change, message):
     with pytest.raises(ValueError, match=message):
         statespace.Config.from_json(values)
     assert statespace.Config.from_json(CONFIG.to_json()) == CONFIG
+    assert "outcome_names" not in CONFIG.to_json()  # as in the configurations of older versions
+    named = dataclasses.replace(CONFIG, outcome_names=("a", "b", "c")[: CONFIG.outcomes])
+    assert statespace.Config.from_json(json.loads(json.dumps(named.to_json()))) == named

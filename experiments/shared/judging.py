@@ -8,6 +8,7 @@ from typing import NamedTuple
 import sts_jax as sts
 from experiments.shared import drawing, pictures, results
 from experiments.shared.config import MODELS, TITLES, Config, main_model, model_folder, schedule
+from experiments.shared.extensions import NONE, Extensions
 from experiments.shared.progress import Bar, say
 from experiments.shared.rerolls import ceilings
 from sts_jax import dataset, evaluation, storage, training
@@ -34,7 +35,14 @@ class SplitPairs(NamedTuple):
     test: dataset.Pairs  # the same held-out trajectories, as targets
 
 
-def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sensor, split: str) -> str:
+def evaluate(
+    config: Config,
+    data: dataset.Dataset,
+    workdir: Path,
+    sensor: sts.Sensor,
+    split: str,
+    own: Extensions = NONE,
+) -> str:
     """Score every model on held-out trajectories, write the results to files, and return the main table.
 
     The results are `metrics.json`, `table.md`, `table-full.md` and `figures/` in the work directory. `metrics.json`
@@ -47,6 +55,7 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
         workdir: Work directory with the trained models.
         sensor: Sensor of the collection.
         split: Split, one of `config.splits`.
+        own: Your own metrics, columns and modalities.
 
     Returns:
         The main table in Markdown.
@@ -54,23 +63,33 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
     suffix = "" if split == config.splits[0] else f"-by-{split}"
     done, figures = workdir / f"metrics{suffix}.json", workdir / f"figures{suffix}"
     table, complete = workdir / f"table{suffix}.md", workdir / f"table-full{suffix}.md"
-    inputs = _inputs(config, data, workdir, split)
+    inputs = _inputs(config, data, workdir, split, own)
     reason = results.stale(done, inputs)
     if reason is None:
         return table.read_text()
     if done.exists() or table.exists():
         say(f"evaluate: again, because {reason}")
-    pairs, scenario = _pairs_of_split(config, data, split), config.collection.scenario
-    judge = evaluation.scorer(scenario, pairs.train)
-    test, times, num = pairs.test, config.rerolls, config.num_rerolled
-    possible = ceilings(workdir, suffix, config.collection, sensor, data, test, times=times, num=num, judge=judge)
+    pairs, scenario = _pairs_of_split(config, data, split, own), config.collection.scenario
+    judge, test = evaluation.scorer(scenario, pairs.train, metrics=own.scored), pairs.test
+    possible = ceilings(
+        workdir,
+        suffix,
+        config.collection,
+        sensor,
+        data,
+        test,
+        times=config.rerolls,
+        num=config.num_rerolled,
+        judge=judge,
+        metrics=own.scored,
+    )
     references = evaluation.baselines(scenario, pairs.train, test)
     scores = {**possible.scores, **{title: judge(row, test) for title, row in references.items()}}
     with Bar() as bar:
-        own, shown = _scored(config, workdir, split, pairs, judge, bar)
-        scores |= own
-        summary = evaluation.summarise(scores, test, outcomes=scenario.outcomes)
-        bar("evaluate", len(own), len(own), "intervals done")
+        predicted, shown = _scored(config, workdir, split, pairs, judge, bar)
+        scores |= predicted
+        summary = evaluation.summarise(scores, test, metrics=own.scored, outcomes=scenario.outcomes)
+        bar("evaluate", len(predicted), len(predicted), "intervals done")
 
     folders = {TITLES[name]: model_folder(workdir, name, config, split) for name in MODELS[config.model]}
     logs = {title: records.read(folder / records.NAME) for title, folder in folders.items()}
@@ -86,26 +105,29 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
         _notes(config, logs),
     )
     notes += _gains(TITLES[main_model(config)], scores, test)
-    text = evaluation.table(summary, title=title, rows=main_rows(TITLES[main_model(config)], list(shown)), notes=notes)
+    rows = main_rows(TITLES[main_model(config)], list(shown))
+    text = evaluation.table(summary, title=title, rows=rows, notes=notes, columns=own.columns)
     storage.write_bytes(table, text.encode())
-    storage.write_bytes(complete, evaluation.full_table(summary, title=title, notes=notes).encode())
+    storage.write_bytes(complete, evaluation.full_table(summary, title=title, notes=notes, metrics=own.scored).encode())
     results.write(done, {"split": split, **summary}, inputs, [table, complete, *drawn])
     return text
 
 
-def _inputs(config: Config, data: dataset.Dataset, workdir: Path, split: str) -> dict[str, str]:
-    """The checksums of the configuration, the dataset and the models, by name."""
+def _inputs(config: Config, data: dataset.Dataset, workdir: Path, split: str, own: Extensions) -> dict[str, str]:
+    """The checksums of the configuration, the dataset, the models, and the metrics if they are not the default."""
     inputs = {"config.json": storage.digest(dataclasses.asdict(config)), "dataset": data.identity}
     for folder in (model_folder(workdir, name, config, split) for name in MODELS[config.model]):
         inputs[folder.relative_to(workdir).as_posix()] = results.identity(folder)
+    if own.described() != NONE.described():
+        inputs["the list of metrics"] = storage.digest(own.described())
     return inputs
 
 
-def _pairs_of_split(config: Config, data: dataset.Dataset, split: str) -> SplitPairs:
+def _pairs_of_split(config: Config, data: dataset.Dataset, split: str, own: Extensions) -> SplitPairs:
     """Load the first and last frames of a split, in the resolutions that `SplitPairs` describes."""
-    rows = evaluation.rows_of(data, split)
-    train = dataset.reduced(data.pairs(rows["train"], symmetries=True), config.image_size)
-    validation, given = data.pairs(rows["validation"]), data.pairs(rows["test"])
+    rows, further = evaluation.rows_of(data, split), own.measurements
+    train = dataset.reduced(data.pairs(rows["train"], symmetries=True, measurements=further), config.image_size)
+    validation, given = (data.pairs(rows[part], measurements=further) for part in ("validation", "test"))
     test = dataset.reduced(given, config.image_size)
     if config.model == "paper":
         validation, given = dataset.reduced(validation, config.image_size), test

@@ -104,7 +104,7 @@ class Live:
     """Predicts the resting state in a background thread, always from the newest images.
 
     ```python
-    with Live(predictor, views, names, (), show) as live:
+    with Live(predictor, views, (), show) as live:
         live.offer(visual, tactile)
         live.newest
     ```
@@ -114,7 +114,6 @@ class Live:
         self,
         predictor: sts.Predictor,
         views: Views,
-        outcomes: tuple[str, ...],
         condition: tuple[float, ...],
         show: Callable[[], None],
     ):
@@ -125,9 +124,6 @@ class Live:
         Args:
             predictor: Trained model. Visual images must be among its inputs.
             views: Conversion from raw images to the view of the sensor.
-            outcomes: Names of the outcomes of the model's scenario, in the scenario's order. If the number of
-                names differs from the number of predicted outcomes, the names `outcome 0`, `outcome 1` and so on are
-                used.
             condition: Known quantities of the scenario that the model receives (SI units). An empty tuple stands for
                 zeros.
             show: Function that the thread calls after each prediction. The latency includes this call.
@@ -143,7 +139,7 @@ class Live:
                 f"the number of values of --condition must be {width}, got {len(condition)}: change this option, or "
                 f"leave it out. The model is {predictor!r}"
             )
-        self._predictor, self._views, self._outcomes = predictor, views, outcomes
+        self._predictor, self._views = predictor, views
         self._condition = np.asarray(condition or (0.0,) * width, np.float32) if width else None
         self._show = show
         self._streams = tuple(name for name in ("visual", "tactile") if name in predictor.modalities)
@@ -243,10 +239,8 @@ class Live:
         contact, occupied = self._contact(visual, tactile)
         view = self._views.prepared(visual.image, tactile.image, self._untouched)
         found = self._compute(view._asdict(), contact=contact is not False)
-        names = self._outcomes
         chances = [] if found.outcome_probability is None else np.asarray(found.outcome_probability).tolist()
-        if len(names) != len(chances):
-            names = tuple(f"outcome {number}" for number in range(len(chances)))
+        names = self._predictor.outcomes or tuple(f"outcome {number}" for number in range(len(chances)))
         return Predicted(
             _shown(found.visual),
             _shown(found.tactile),

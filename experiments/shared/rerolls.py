@@ -3,7 +3,7 @@
 A re-roll is a new simulation from the first pose of a trajectory, with newly drawn hidden properties such as friction.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -42,12 +42,14 @@ def ceilings(
     times: int,
     num: int,
     judge: Judge,
+    metrics: Sequence[evaluation.Metric] = evaluation.METRICS,
 ) -> Ceilings:
     """Read the re-rolls of the first `num` held-out trajectories, or compute and write the re-rolls.
 
     A re-roll is a new simulation from the first pose of a trajectory, with newly drawn hidden properties such as
     friction. The re-rolls are in `ceiling{suffix}.npz`. `ceiling{suffix}.json` records the checksums of the inputs of
-    the computation. If an input has changed, the re-rolls are computed again.
+    the computation. If an input has changed, the re-rolls are computed again. A changed function of a metric is not
+    noticed, because functions cannot be compared.
 
     Args:
         workdir: Work directory.
@@ -59,14 +61,18 @@ def ceilings(
         times: Number of re-rolls of each trajectory.
         num: Number of trajectories with re-rolls.
         judge: Function that scores a prediction of the first `num` held-out trajectories (`evaluation.scorer`).
+        metrics: Metrics of `judge`.
     """
-    few = dataset.Pairs(*(leaf[:num] for leaf in test))
+    few = test.take(slice(num))
     record, path = workdir / f"ceiling{suffix}.json", workdir / f"ceiling{suffix}.npz"
     inputs = {
         "dataset": data.identity,
         "the held-out list": storage.digest(few.trajectory.tolist()),
         "the re-rolls": storage.digest([times, SEED, FORMAT]),
     }
+    further = sorted(metric.name for metric in metrics if metric.errors is not None)
+    if further:  # none of the library's metrics
+        inputs["the list of metrics with errors"] = storage.digest(further)
     reason = results.stale(record, inputs)
     if reason is not None:
         if record.exists():
@@ -116,12 +122,14 @@ def reroll(
 
 
 def _flat(made: Ceilings) -> dict[str, np.ndarray]:
-    """All arrays by a path such as `one re-roll/visual/bce`, for a file."""
+    """All arrays by a path such as `one re-roll/visual/bce` or `one re-roll/further/height_error`, for a file."""
     arrays = {"pose": made.pose, "outcome": made.outcome}
     for name, scores in made.scores.items():
         for field, value in scores._asdict().items():
             if isinstance(value, evaluation.metrics.ImageError):
                 arrays |= {f"{name}/{field}/{part}": leaf for part, leaf in value._asdict().items()}
+            elif isinstance(value, dict):
+                arrays |= {f"{name}/{field}/{part}": leaf for part, leaf in value.items()}
             elif isinstance(value, np.ndarray):
                 arrays[f"{name}/{field}"] = value
     return arrays
@@ -136,7 +144,7 @@ def _restored(arrays: dict[str, np.ndarray]) -> Ceilings:
             key: leaf for key, leaf in own.items() if "/" not in key
         }
         for field in {key.partition("/")[0] for key in own if "/" in key}:
-            parts = evaluation.metrics.ImageError._fields
-            fields[field] = evaluation.metrics.ImageError(*(own[f"{field}/{part}"] for part in parts))
+            parts = {key.partition("/")[2]: leaf for key, leaf in own.items() if key.startswith(f"{field}/")}
+            fields[field] = parts if field == "further" else evaluation.metrics.ImageError(**parts)
         scores[name] = evaluation.Scores(**fields)
     return Ceilings(scores, arrays["pose"], arrays["outcome"])

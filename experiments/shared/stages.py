@@ -8,7 +8,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 import sts_jax as sts
-from experiments.shared.config import MODELS, Config, check, model_folder
+from experiments.shared.config import MODELS, Config, check, main_model, model_folder
+from experiments.shared.extensions import NONE, Extensions
 from experiments.shared.judging import evaluate
 from experiments.shared.progress import Bar, say
 from sts_jax import dataset, evaluation, mvae, statespace, storage, training
@@ -17,20 +18,27 @@ from sts_jax.training import TrainConfig
 Stage = Literal["collect", "train", "evaluate"]
 
 
-def main(config: Config, workdir: Path, *, only: Stage | None = None) -> None:
+def main(config: Config, workdir: Path, *, only: Stage | None = None, own: Extensions = NONE) -> None:
     """Collect the dataset, train the models, evaluate them, and print the main table.
 
     Args:
         config: Configuration of the experiment.
         workdir: Work directory for the results.
         only: Stage to run, with the results of the earlier stages in `workdir`. None: run all stages.
+        own: Your own loss, optimiser, logger, metrics and modalities.
 
     Raises:
-        ValueError: A field of the configuration is out of range, or the work directory has another configuration.
+        ValueError: A field of the configuration is out of range, the work directory has another configuration, or a
+            model in it was trained with a loss or an optimiser that `own` lacks, or with other notes.
         FileNotFoundError: A stage before `only` has not been run.
         LockedError: Another process works in the work directory.
     """
     check(config)
+    if own.measurements and config.model != "paper":
+        raise ValueError(
+            f"measurements has {own.measurements[0].name!r}, but only the paper's models accept further modalities: "
+            "choose a configuration with model='paper'"
+        )
     sensor = sts.Sensor()
     with storage.lock(workdir):
         claim(config, workdir)
@@ -39,10 +47,10 @@ def main(config: Config, workdir: Path, *, only: Stage | None = None) -> None:
             return
         for split in config.splits:
             if only in (None, "train"):
-                train(config, data, workdir, sensor, split)
+                train(config, data, workdir, sensor, split, own)
             if only in (None, "evaluate"):
                 _check_trained(config, workdir, split)
-                print(evaluate(config, data, workdir, sensor, split))
+                print(evaluate(config, data, workdir, sensor, split, own))
 
 
 def claim(config: Config, workdir: Path) -> None:
@@ -121,6 +129,7 @@ def jobs(
     pairs: dataset.Pairs,
     views: dataset.Views | None = None,
     falls: dataset.Ends | None = None,
+    measurements: tuple[dataset.Measurement, ...] = (),
 ) -> Iterator[Job]:
     """Prepare the training of each model of an experiment.
 
@@ -131,6 +140,7 @@ def jobs(
         views: Further images of the training objects. Only the state-space model uses them.
         falls: First and last poses in trajectories of the training objects, without images. Only the state-space model
             uses these poses.
+        measurements: Further modalities of the paper's model with all modalities. `pairs` must have their values.
     """
     preprocessing, scenario = preprocessing_of(config), config.collection.scenario
     frame = dataset.empty_frame(sensor, config.collection)
@@ -143,14 +153,23 @@ def jobs(
         return
     pairs, empty = dataset.reduced(pairs, config.image_size), dataset.reduced_images(empty, config.image_size)
     for number, (name, modalities) in enumerate(MODELS["paper"].items()):
-        arrays, own = training.frame_arrays(pairs, modalities, preprocessing, empty["tactile"])
+        further = measurements if name == main_model(config) else ()
+        arrays, own = training.frame_arrays(pairs, modalities, preprocessing, empty["tactile"], measurements=further)
         schedule = config.training
         if config.steps is not None:
             schedule = dataclasses.replace(schedule, steps=config.steps[number])
-        yield Job(name, schedule, training.paper_model(modalities, own), arrays, own, empty)
+        model = training.paper_model(modalities, own, measurements=further)
+        yield Job(name, schedule, model, arrays, own, empty)
 
 
-def train(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sensor, split: str) -> None:
+def train(
+    config: Config,
+    data: dataset.Dataset,
+    workdir: Path,
+    sensor: sts.Sensor,
+    split: str,
+    own: Extensions = NONE,
+) -> None:
     """Train the models of an experiment on one split, and show the progress.
 
     Args:
@@ -159,19 +178,27 @@ def train(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sens
         workdir: Work directory for the models.
         sensor: Sensor of the collection.
         split: Split, one of `config.splits`.
+        own: Your own loss, optimiser, logger and modalities.
     """
     rows, more = evaluation.rows_of(data, split)["train"], config.model == "statespace"
     views = data.views("train") if more else None
     falls = data.ends(data.members("train", rendered=False)) if more else None
     # The trajectories are passed without a variable of their own, so that `jobs` can free their memory.
-    for job in jobs(config, sensor, data.pairs(rows, symmetries=True), views, falls):
+    for job in jobs(
+        config,
+        sensor,
+        data.pairs(rows, symmetries=True, measurements=own.measurements),
+        views,
+        falls,
+        own.measurements,
+    ):
         with Bar() as bar:
 
             def show(done: int, total: int, record: dict[str, float], bar: Bar = bar, name: str = job.name) -> None:
                 bar(f"train {name}", done, total, f"loss {record['loss']:.4g}" if record else "")
 
             folder = model_folder(workdir, job.name, config, split)
-            run(job, folder, config.targets, show)
+            run(job, folder, config.targets, show, own)
             if isinstance(job.model, statespace.Config):
                 validation = data.pairs(evaluation.rows_of(data, split)["validation"])
                 calibrate(job, job.model, folder, config, validation)
@@ -182,6 +209,7 @@ def run(
     folder: Path,
     targets: Literal["all", "own"],
     progress: Callable[[int, int, dict[str, float]], None],
+    own: Extensions = NONE,
 ) -> None:
     """Train a model in a folder, or continue an interrupted training.
 
@@ -191,6 +219,7 @@ def run(
         targets: Modalities that a model of the paper learns to predict from a subset of its inputs. "all": all
             modalities. "own": only the modalities of the subset.
         progress: Function that receives the number of finished steps, the number of all steps, and values of the log.
+        own: Your own loss, optimiser and logger.
     """
     training.save_blank(folder, job.empty["visual"], job.empty["tactile"])
     training.train(
@@ -201,7 +230,11 @@ def run(
         absent=job.preprocessing.absent,
         targets=targets,
         preprocessing=dataclasses.asdict(job.preprocessing),
+        loss=None if own.loss is None else own.loss(job.model),
+        optimiser=own.optimiser,
+        notes=own.notes,
         progress=progress,
+        log=None if own.log is None else own.log(job.name),
     )
 
 

@@ -16,6 +16,7 @@ from sts_jax.dataset.loading import Views as Views
 from sts_jax.dataset.loading import load as load
 from sts_jax.dataset.loading import reduced as reduced
 from sts_jax.dataset.loading import reduced_images as reduced_images
+from sts_jax.dataset.measurement import Measurement as Measurement
 from sts_jax.dataset.meshes import Meshes as Meshes
 from sts_jax.dataset.meshes import mesh_classes as mesh_classes
 from sts_jax.dataset.meshes import survey_meshes as survey_meshes
@@ -30,6 +31,7 @@ __all__ = [
     "Dataset",
     "Ends",
     "Images",
+    "Measurement",
     "Meshes",
     "Pairs",
     "Progress",

@@ -3,14 +3,17 @@
 import concurrent.futures
 import dataclasses
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from sts_jax.dataset import records
 from sts_jax.dataset.collection import PARTS
+from sts_jax.dataset.measurement import Measurement, measured
 from sts_jax.dataset.symmetry import turn, turn_condition
 from sts_jax.storage import DamagedFileError, digest, read_json, sha256
 
@@ -34,6 +37,17 @@ class Pairs(NamedTuple):
     support: np.ndarray  # float32 (n, 128): support function of the body or of its mirror image (m), `objects.support`
     mass: np.ndarray  # float32 (n,): mass of the object with its contents (kg)
     com: np.ndarray  # float32 (n, 3): centre of mass in the mesh frame (m), mirrored like the body
+    # (n, 2, *shape) each: the values of further modalities by name, uint8 or float32, NaN where not measured
+    measurements: dict[str, np.ndarray] = {}  # noqa: RUF012 (never changed)
+
+    def take(self, rows: np.ndarray | slice) -> "Pairs":
+        """Return some of the trajectories.
+
+        Args:
+            rows: Indices, a bool mask `(n,)`, or a slice such as `slice(10)` for the first ten.
+        """
+        taken: Pairs = jax.tree.map(lambda leaf: leaf[rows], self)
+        return taken
 
 
 class Ends(NamedTuple):
@@ -284,16 +298,20 @@ class Dataset:
             )
         return trajectories.astype(np.int64)
 
-    def pairs(self, trajectories: np.ndarray, *, symmetries: bool = False) -> Pairs:
+    def pairs(
+        self, trajectories: np.ndarray, *, symmetries: bool = False, measurements: Sequence[Measurement] = ()
+    ) -> Pairs:
         """Read the first and last frames of some trajectories, with the true shapes and masses of the objects.
 
         Args:
             trajectories: Indices of the trajectories, int `(n,)`.
             symmetries: True to add the turned and mirrored copies of the frames. The dataset contains copies if its
                 collection has `symmetries=True`. In the result, each trajectory is directly followed by its copies.
+            measurements: Further modalities to measure. Their values are in `Pairs.measurements`.
 
         Raises:
-            ValueError: An index is not a whole number or is out of range, or its trajectory has no images.
+            ValueError: An index is not a whole number or is out of range, its trajectory has no images, or a function
+                of a measurement is missing or returns a wrong shape, type or value.
             FileNotFoundError: A shard is missing.
             DamagedFileError: A shard is damaged. The message names it.
         """
@@ -331,6 +349,7 @@ class Dataset:
             support=np.where(mirrored, self.solid["mirrored"][index], self.solid["support"][index]),
             mass=self.solid["mass"][index],
             com=np.where(mirrored, com * np.array([1, -1, 1], np.float32), com),
+            measurements=measured(measurements, self, trajectories, kinds),
         )
 
 

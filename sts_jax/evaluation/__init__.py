@@ -3,6 +3,7 @@
 from sts_jax.evaluation import figures, gap, metrics
 from sts_jax.evaluation.catalogue import COLUMNS, METRICS
 from sts_jax.evaluation.images import STREAMS, image_baselines, image_summary
+from sts_jax.evaluation.measurements import measurement_error
 from sts_jax.evaluation.outcomes import emptiness, frequency, outcome_of_image, outcome_of_pose, shares
 from sts_jax.evaluation.predictions import TRUE_STATE, Forecaster, Predicted, first, joined, predict, subsets
 from sts_jax.evaluation.records import Column, Judged, Metric, Scores
@@ -41,6 +42,7 @@ __all__ = [
     "image_baselines",
     "image_summary",
     "joined",
+    "measurement_error",
     "metrics",
     "outcome_of_image",
     "outcome_of_pose",

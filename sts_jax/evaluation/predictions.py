@@ -9,6 +9,7 @@ import numpy as np
 
 from sts_jax import physics, training
 from sts_jax.dataset import Pairs
+from sts_jax.dataset.measurement import NAMES
 from sts_jax.evaluation.metrics import best_threshold
 from sts_jax.evaluation.outcomes import emptiness, outcome_of_image, outcome_of_pose, shares
 
@@ -29,6 +30,7 @@ class Predicted(NamedTuple):
     outcome: np.ndarray | None = None  # int (n,): number of the outcome, one of `Scenario.outcomes`
     samples: "Predicted | None" = None  # k samples with a further first axis, (k, n, ...), or None for a single frame
     outcome_probability: np.ndarray | None = None  # float (n, c), in the order of `Scenario.outcomes`
+    measurements: dict[str, np.ndarray] | None = None  # further modalities by name, (n, *shape), float or uint8
 
 
 def first(predicted: Predicted, count: int) -> Predicted:
@@ -57,6 +59,7 @@ def _mapped(
         return function(there, axis) if there else None
 
     samples = [part.samples for part in parts if part.samples is not None]
+    further = [part.measurements for part in parts if part.measurements is not None]
     return Predicted(
         visual=apply([part.visual for part in parts]),
         tactile=apply([part.tactile for part in parts]),
@@ -64,6 +67,7 @@ def _mapped(
         outcome=apply([part.outcome for part in parts]),
         samples=_mapped(function, samples, 1) if samples else None,
         outcome_probability=apply([part.outcome_probability for part in parts]),
+        measurements={name: function([own[name] for own in further], axis) for name in further[0]} if further else None,
     )
 
 
@@ -78,7 +82,7 @@ class Forecaster(Protocol):
 
     @property
     def modalities(self) -> tuple[str, ...]:
-        """The inputs that the model accepts: some of `visual`, `tactile` and `pose`."""
+        """The inputs that the model accepts: some of `visual`, `tactile` and `pose`, and further modalities."""
 
     @property
     def preprocessing(self) -> training.Preprocessing:
@@ -97,9 +101,12 @@ class Forecaster(Protocol):
     ) -> Any:
         """Predict from the inputs that are not None. See `sts_jax.Predictor` for the arguments.
 
+        If `modalities` has further modalities (`dataset.Measurement`), the model must also accept the arguments
+        `measurements` and `present` of `sts_jax.Predictor`.
+
         Returns:
             An object with the fields `visual`, `tactile`, `pose`, `outcome_probability` and `samples` of
-            `sts_jax.predict.Prediction`.
+            `sts_jax.predict.Prediction`. The field `measurements` is optional.
         """
 
     def prior(self, shape: tuple[int, ...] = (), *, condition: Any = None) -> Any:
@@ -179,13 +186,20 @@ def predict(
         The predictions for all trajectories of `test`.
 
     Raises:
-        ValueError: `test` has no trajectories.
+        ValueError: `test` has no trajectories, or `test` or `validation` lacks a further modality in `inputs`.
     """
     names = tuple(inputs)
     if len(test.object) == 0:
         raise ValueError(
             "`test` has 0 trajectories, but at least one is needed: choose a split with held-out trajectories"
         )
+    for name, pairs in (("test", test), ("validation", validation)):
+        lacking = set(names) - set(NAMES) - set(test.measurements if pairs is None else pairs.measurements)
+        if lacking:
+            raise ValueError(
+                f"`{name}` lacks {', '.join(sorted(lacking))}: pass measurements=... to Dataset.pairs for all parts of "
+                "the dataset"
+            )
 
     def run(pairs: Pairs, num_samples: int) -> Predicted:
         """Predict the trajectories in groups of equal size, to limit the memory.
@@ -218,7 +232,9 @@ def _asked(
 ) -> Predicted:
     """Predict the trajectories `rows` of `pairs` from the inputs `names`. The images of samples become `uint8`."""
     condition = pairs.condition[rows] if pairs.condition.shape[1] else None
+    further = {name: in_unit(pairs.measurements[name][rows, 0]) for name in names if name in pairs.measurements}
     if names:
+        masks = {name: ~np.isnan(x).reshape(len(rows), -1).any(-1) for name, x in further.items()}
         out = predictor(
             visual=pairs.visual[rows, 0] / 255 if "visual" in names else None,
             tactile=pairs.tactile[rows, 0] / 255 if "tactile" in names else None,
@@ -227,17 +243,19 @@ def _asked(
             state=_true_states(predictor, pairs, rows) if "state" in names else None,
             key=jax.random.key(seed) if num_samples else None,
             num_samples=num_samples,
+            **({"measurements": further, "present": masks} if further else {}),
         )
     else:
         out = predictor.prior((len(rows),), condition=condition)
     found = (out.visual, out.tactile, out.pose, out.outcome_probability)
     visual, tactile, pose, probability = (None if leaf is None else np.asarray(leaf) for leaf in found)
+    measurements = jax.tree.map(np.asarray, getattr(out, "measurements", None))
     samples = None
     if out.samples is not None:
         images = (out.samples.visual, out.samples.tactile)
         drawn, felt = (None if leaf is None else np.round(255 * np.asarray(leaf)).astype(np.uint8) for leaf in images)
         samples = Predicted(drawn, felt, None if out.samples.pose is None else np.asarray(out.samples.pose))
-    return Predicted(visual, tactile, pose, samples=samples, outcome_probability=probability)
+    return Predicted(visual, tactile, pose, samples=samples, outcome_probability=probability, measurements=measurements)
 
 
 def _true_states(predictor: Forecaster, pairs: Pairs, rows: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ import numpy as np
 from sts_jax import physics
 from sts_jax.dataset import Pairs
 from sts_jax.evaluation.outcomes import outcome_of_pose
-from sts_jax.evaluation.predictions import Predicted
+from sts_jax.evaluation.predictions import Predicted, in_unit
 
 CONSTANT, COPY, NEIGHBOUR = "constant (mean training target)", "copy of the input", "nearest neighbour"
 BELOW = "rests below its start"
@@ -29,6 +29,9 @@ def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str
     - The rule "rests below its start" keeps x, y and the orientation of the first pose. The predicted height is the
       median of the heights of the training objects in their last frames, without the objects that leave the pad. The
       rule predicts no images.
+
+    The first three also predict the further modalities (`Pairs.measurements`). A value that was not measured is NaN in
+    the copy and in the nearest neighbour, and does not count in the mean of the constant.
 
     Args:
         scenario: The scenario of the trajectories.
@@ -62,6 +65,7 @@ def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str
     rests = train.outcome != int(physics.Outcome.FELL_OFF)
     below = test.pose[:, 0].copy()
     below[:, 2] = np.median(train.pose[rests if rests.any() else slice(None), 1, 2])
+    further = {name: in_unit(values) for name, values in train.measurements.items() if name in test.measurements}
     return {
         CONSTANT: Predicted(
             repeat(train.visual[:, 1].mean(0) / 255),
@@ -69,18 +73,27 @@ def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str
             repeat(mean_pose),
             np.full(num, majority),
             outcome_probability=repeat(frequency),
+            measurements={name: repeat(_mean(values[:, 1])) for name, values in further.items()} or None,
         ),
         COPY: Predicted(
             test.visual[:, 0] / 255,
             test.tactile[:, 0] / 255,
             test.pose[:, 0],
             outcome_of_pose(scenario, test.pose[:, 0], test.pose[:, 0]),
+            measurements={name: in_unit(test.measurements[name][:, 0]) for name in further} or None,
         ),
         NEIGHBOUR: Predicted(
             train.visual[nearest, 1] / 255,
             train.tactile[nearest, 1] / 255,
             train.pose[nearest, 1],
             train.outcome[nearest],
+            measurements={name: values[nearest, 1] for name, values in further.items()} or None,
         ),
         BELOW: Predicted(pose=below, outcome=outcome_of_pose(scenario, test.pose[:, 0], below)),
     }
+
+
+def _mean(values: np.ndarray) -> np.ndarray:
+    """The mean over the items that were measured, or NaN if there is none."""
+    known = values[~np.isnan(values).reshape(len(values), -1).any(1)]
+    return known.mean(0) if len(known) else np.full(values.shape[1:], np.nan)

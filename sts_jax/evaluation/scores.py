@@ -60,7 +60,7 @@ def score(
     """
     leaves = (predicted.visual, predicted.tactile, predicted.pose, predicted.outcome, predicted.outcome_probability)
     count = next((len(leaf) for leaf in leaves if leaf is not None), len(test.object))
-    test = Pairs(*(leaf[:count] for leaf in test))
+    test = test.take(slice(count))
     scores = _with_samples(_of_point(predicted, test), predicted, test)
     if predicted.outcome_probability is not None:
         scores = _with_probability(scores, predicted.outcome_probability, test, outcomes, frequency)

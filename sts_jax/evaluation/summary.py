@@ -147,5 +147,5 @@ def _statistics(
     scores: Mapping[str, Scores], name: str, count: int, test: Pairs, metrics: Sequence[Metric]
 ) -> list[Statistic | None]:
     """The metrics of a predictor, each as a function of the weights of its items, or None."""
-    judged = Judged(scores[name], scores[CONSTANT].first(count), Pairs(*(leaf[:count] for leaf in test)))
+    judged = Judged(scores[name], scores[CONSTANT].first(count), test.take(slice(count)))
     return [metric.of(judged) for metric in metrics]

@@ -8,6 +8,7 @@ from sts_jax.statespace import harmonics
 IMAGES = ("visual", "tactile")  # names of the images
 INPUTS = (*IMAGES, "pose")  # names of all inputs that a model can have
 TINT = 3  # numbers of the tint
+_ADDED = (("vectors", 1), ("outcome_names", ()))  # fields that older versions lack, and their default values
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,6 +51,8 @@ class Config:
     drawn: float = 0.4375  # share of a batch with a rendered last frame (the whole batch trains the other parts)
     drawn_first: float = 0.125  # share of a batch with a rendered first frame
     vectors: int = 1  # number of vectors (x, y) in the plane of the pad with which the condition begins
+    # name of each outcome in words, such as "fell off", or empty if the names are unknown
+    outcome_names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.inputs or [name for name in INPUTS if name in self.inputs] != list(self.inputs):
@@ -80,6 +83,11 @@ class Config:
                 f"traits is {self.traits}, but it must be >= {TINT}, because the first {TINT} traits describe the mean "
                 "colour of the object"
             )
+        if self.outcome_names and len(self.outcome_names) != self.outcomes:
+            raise ValueError(
+                f"outcome_names has {len(self.outcome_names)} names {self.outcome_names}, but outcomes is "
+                f"{self.outcomes}: give one name for each outcome, or none"
+            )
         for name in ("drawn", "drawn_first"):
             if not 0 < getattr(self, name) <= 1:
                 raise ValueError(
@@ -94,12 +102,12 @@ class Config:
     def to_json(self) -> dict[str, Any]:
         """The fields by name, in values that `json.dumps` accepts.
 
-        The field `vectors` is left out if it has its default value 1. Older versions saved configurations without this
-        field. The result is therefore equal to the saved configuration of an older version, and the training of the
-        older version can be resumed.
+        The fields `vectors` and `outcome_names` are left out if they have their default values. Older versions saved
+        configurations without these fields. The result is therefore equal to the saved configuration of an older
+        version, and the training of the older version can be resumed.
         """
         values = dataclasses.asdict(self)
-        return {name: value for name, value in values.items() if (name, value) != ("vectors", 1)}
+        return {name: value for name, value in values.items() if (name, value) not in _ADDED}
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> "Config":

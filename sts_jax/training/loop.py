@@ -27,6 +27,7 @@ from sts_jax.training.model import KINDS, Model, load
 
 Progress = Callable[[int, int, dict[str, float]], None]  # arguments: steps done, steps in total, latest record
 Log = Callable[[int, dict[str, float]], None]  # arguments: step of a record, its other numbers by name
+_LABELS = ("model.outcome_names",)  # fields that the config.json of an older version may lack
 
 
 def initial(
@@ -176,11 +177,11 @@ def train(
     settings = json.loads(json.dumps(settings))
     there = manifest.read(workdir)
     if there is not None and there.step == total:  # without a lock, because a lock would write a file
-        storage.claim(workdir / "config.json", settings)
+        storage.claim(workdir / "config.json", settings, labels=_LABELS)
         _send(records.read(workdir / records.NAME, total), log)
         return load(workdir)
     with storage.lock(workdir):
-        storage.claim(workdir / "config.json", settings)
+        storage.claim(workdir / "config.json", settings, labels=_LABELS)
         optimiser = optimiser or optimisers.optimiser(config, total)
         graphdef, state = initial(config, task, total, optimiser)
         state = restore(workdir, state) or state

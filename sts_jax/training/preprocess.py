@@ -4,6 +4,7 @@ import dataclasses
 import json
 from typing import Any, Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8
@@ -43,6 +44,8 @@ class Preprocessing:
     touch_level: bool = False  # subtract the median change first, so that a change of all light is not a contact
     absent: tuple[str, ...] = ()  # modalities that no training sample had as an input
     condition_scale: tuple[float, ...] = ()  # SI units, divisors of the numbers of the scenario's condition
+    # name and scale (SI units) of each further modality with a vector of numbers, see `dataset.Measurement`
+    scales: tuple[tuple[str, float], ...] = ()
 
     def __post_init__(self) -> None:
         if self.rotation not in ("matrix", "quaternion"):
@@ -104,6 +107,38 @@ class Preprocessing:
             The numbers, each divided by its typical size in the field `condition_scale`.
         """
         return condition / jnp.array(self.condition_scale, jnp.float32)
+
+    def encode(self, name: str, values: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Encode the values of a modality for the networks.
+
+        Args:
+            name: Name of the modality.
+            values: Poses, images in [0, 1], or the numbers of a further modality (SI units).
+
+        Returns:
+            The result of `encode_pose` for the modality `pose`. The numbers of a further modality are divided by its
+            scale in the field `scales`. Images are returned unchanged.
+        """
+        if name == "pose":
+            return self.encode_pose(values)
+        scale = dict(self.scales).get(name)
+        return values if scale is None else values / scale
+
+    def decode(self, name: str, code: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Decode the output of an `mvae` network for a modality.
+
+        Args:
+            name: Name of the modality.
+            code: Output of the network. For images, it consists of logits.
+
+        Returns:
+            The result of `decode_pose` for the modality `pose`, the numbers of a further modality (SI units), or images
+            in [0, 1].
+        """
+        if name == "pose":
+            return self.decode_pose(code)
+        scale = dict(self.scales).get(name)
+        return jax.nn.sigmoid(code) if scale is None else code * scale
 
     def touched(self, tactile: Float[Array, "*n h w 3"], blank: Float[Array, "h w 3"]) -> Bool[Array, "*n"]:
         """Find the tactile images that show a contact.
@@ -199,6 +234,7 @@ def preprocessing_from_json(content: dict) -> Preprocessing:
         content["resolution"] = tuple(content["resolution"])
         content["absent"] = tuple(content["absent"])
         content["condition_scale"] = tuple(content.get("condition_scale", ()))  # older models have no condition
+        content["scales"] = tuple((name, float(scale)) for name, scale in content.get("scales", ()))
         return Preprocessing(**content)
     except (KeyError, TypeError) as error:
         raise ValueError(

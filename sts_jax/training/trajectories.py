@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8
 
 from sts_jax import mvae, optics, physics, statespace
-from sts_jax.dataset import Ends, Pairs, Views, reduced_images
+from sts_jax.dataset import Ends, Measurement, Pairs, Views, reduced_images
 from sts_jax.sensor import Sensor
 from sts_jax.training.arrays import Arrays
 from sts_jax.training.preprocess import Preprocessing
@@ -18,27 +19,46 @@ SOME = 512  # number of items that are encoded at once
 
 
 def frame_arrays(
-    pairs: Pairs, modalities: tuple[str, ...], preprocessing: Preprocessing, blank: np.ndarray
+    pairs: Pairs,
+    modalities: tuple[str, ...],
+    preprocessing: Preprocessing,
+    blank: np.ndarray,
+    *,
+    measurements: Sequence[Measurement] = (),
 ) -> tuple[Arrays, Preprocessing]:
     """Make the training arrays of an `mvae` model: inputs from first frames, targets from last frames.
 
     Args:
         pairs: First and last frames of trajectories, from `dataset.Dataset.pairs`.
-        modalities: Modalities of the model, one or more of `visual`, `tactile` and `pose`.
+        modalities: Modalities of the model, some of `visual`, `tactile` and `pose`.
         preprocessing: Preprocessing that encodes poses and conditions, and detects contacts in tactile images. If the
             first tactile image of a trajectory shows no contact, the trajectory gives a sample without the input
             `tactile`.
         blank: Tactile image of the empty sensor, uint8 `(height, width, 3)`, from `dataset.empty_frame`.
+        measurements: Further modalities of the model. `pairs.measurements` must have their values.
 
     Returns:
-        The arrays, and the preprocessing with a new value of `absent`. This field names the modalities that are
-        missing from the inputs of every sample. If `tactile` is a modality and no first frame shows a contact, `absent`
-        is `("tactile",)`, and the arrays have no input `tactile`. Otherwise `absent` is empty.
+        The arrays, and the preprocessing with new values of `absent` and `scales`. `absent` names the modalities that
+        are missing from the inputs of every sample, and the arrays have no such inputs. It contains `tactile` if no
+        first frame shows a contact, and a further modality if it was measured in no first frame. `scales` has the
+        scales of the further modalities.
+
+    Raises:
+        ValueError: `pairs.measurements` lacks a further modality.
     """
+    lacking = [own.name for own in measurements if own.name not in pairs.measurements]
+    if lacking:
+        raise ValueError(f"pairs.measurements lacks {', '.join(lacking)}: pass measurements=... to Dataset.pairs, too")
+    scales = tuple((own.name, own.scale) for own in measurements if not own.is_image)
+    preprocessing = dataclasses.replace(preprocessing, scales=scales)
     code = np.asarray(_pose_codes(preprocessing, pairs.pose))
     found = {"visual": pairs.visual, "tactile": pairs.tactile, "pose": code}
+    for own in measurements:
+        values = pairs.measurements[own.name]
+        found[own.name] = values if own.is_image else np.asarray(preprocessing.encode(own.name, jnp.asarray(values)))
     condition = np.asarray(preprocessing.encode_condition(jnp.asarray(pairs.condition)))
-    return _arrays(found, modalities, preprocessing, blank, condition if condition.shape[1] else None)
+    further = tuple(own.name for own in measurements)
+    return _arrays(found, modalities, preprocessing, blank, condition if condition.shape[1] else None, further)
 
 
 def image_arrays(
@@ -86,27 +106,37 @@ def _arrays(
     preprocessing: Preprocessing,
     blank: np.ndarray,
     condition: np.ndarray | None,
+    further: tuple[str, ...] = (),
 ) -> tuple[Arrays, Preprocessing]:
     """Make the training arrays of an `mvae` model from encoded first and last frames by modality."""
-    touched = _touched(found["tactile"], preprocessing, blank)
-    absent = ("tactile",) if "tactile" in modalities and not touched.any() else ()
+    # The values of a further modality are NaN where it was not measured.
+    known = {name: ~np.isnan(found[name]).reshape(*found[name].shape[:2], -1).any(-1) for name in further}
+    present = {name: mask[:, 0] for name, mask in known.items() if not mask[:, 0].all()}
+    if "tactile" in modalities:
+        present["tactile"] = _touched(found["tactile"], preprocessing, blank)
+    absent = tuple(name for name, mask in present.items() if not mask.any())
+    names = (*modalities, *further)
     arrays = Arrays(
-        inputs={name: np.ascontiguousarray(found[name][:, 0]) for name in modalities if name not in absent},
-        targets={name: np.ascontiguousarray(found[name][:, 1]) for name in modalities},
-        present={"tactile": touched} if "tactile" in modalities and not absent else {},
+        inputs={name: np.ascontiguousarray(found[name][:, 0]) for name in names if name not in absent},
+        targets={name: np.ascontiguousarray(found[name][:, 1]) for name in names},
+        present={name: mask for name, mask in present.items() if name not in absent},
+        target_present={name: mask[:, 1] for name, mask in known.items() if not mask[:, 1].all()},
         condition=condition,
     )
     return arrays, dataclasses.replace(preprocessing, absent=absent)
 
 
-def paper_model(modalities: tuple[str, ...], preprocessing: Preprocessing) -> mvae.Config:
+def paper_model(
+    modalities: tuple[str, ...], preprocessing: Preprocessing, *, measurements: Sequence[Measurement] = ()
+) -> mvae.Config:
     """Make the configuration of the networks in the See-Through-your-Skin paper.
 
     In the loss, the weight of the reconstruction error is 1 for images and 1000 for the pose.
 
     Args:
-        modalities: Modalities of the model, one or more of `visual`, `tactile` and `pose`.
+        modalities: Modalities of the model, some of `visual`, `tactile` and `pose`.
         preprocessing: Preprocessing of the training arrays.
+        measurements: Further modalities of the model.
 
     Returns:
         The configuration of an `mvae` model.
@@ -114,8 +144,12 @@ def paper_model(modalities: tuple[str, ...], preprocessing: Preprocessing) -> mv
     pose = mvae.Modality("pose", "vector", (preprocessing.pose_size,), weight=1000.0)
     shape = (*preprocessing.resolution, 3)
     images = {name: mvae.Modality(name, "image", shape, start=0.7) for name in ("visual", "tactile")}
-    kept = tuple({**images, "pose": pose}[name] for name in modalities)
-    return mvae.Config(kept, condition=len(preprocessing.condition_scale))
+    kept = [{**images, "pose": pose}[name] for name in modalities]
+    kept += [
+        mvae.Modality(own.name, "image" if own.is_image else "vector", own.shape, weight=own.weight)
+        for own in measurements
+    ]
+    return mvae.Config(tuple(kept), condition=len(preprocessing.condition_scale))
 
 
 def state_arrays(
@@ -266,6 +300,7 @@ def state_model(
     model = statespace.Config(
         inputs=tuple(name for name in statespace.INPUTS if name not in absent),
         outcomes=len(scenario.outcomes),
+        outcome_names=tuple(scenario.named(int(outcome)) for outcome in scenario.outcomes),
         condition=len(preprocessing.condition_scale),
         vectors=scenario.vectors if scenario.quantities else 1,
         input_size=height,

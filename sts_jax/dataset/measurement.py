@@ -1,0 +1,120 @@
+"""Specifications of further modalities: measurements of a frame other than the two images and the pose."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+NAMES = ("visual", "tactile", "pose", "state")  # names of inputs that every dataset has
+
+
+@dataclasses.dataclass(frozen=True)
+class Measurement:
+    """Specification of a further modality, such as the force on the pad or an image of a second camera.
+
+    This object is all that datasets, `mvae` models, `Predictor` and the evaluation need to know of the modality.
+
+    Raises:
+        ValueError: The name, the shape, the scale or the weight is not allowed.
+    """
+
+    name: str  # name of the modality, other than `visual`, `tactile`, `pose` and `state`
+    shape: tuple[int, ...]  # (size,) for a vector of numbers, or (height, width, channels) for an image in [0, 1]
+    # Function of a `Dataset` and of the indices of n trajectories. It returns the values in the first and last frames,
+    # `(n, 2, *shape)`: numbers in SI units, or images as floats in [0, 1] or as uint8. A value that was not measured is
+    # NaN in all its numbers. The models ignore such values.
+    measure: Callable[[Any, np.ndarray], np.ndarray]
+    unit: str = ""  # SI unit of the numbers, for tables
+    scale: float = 1.0  # typical size of the numbers (SI units). The networks receive the numbers divided by this size
+    weight: float = 1.0  # weight of the reconstruction error in the loss of `mvae` models
+    # Function of values `(n, 2, *shape)` and of the number of a symmetry, 0 to 7 (`Dataset.pairs`), that returns the
+    # values in the turned or mirrored trajectories. It is needed only for `Dataset.pairs(..., symmetries=True)`.
+    turn: Callable[[np.ndarray, int], np.ndarray] | None = None
+
+    def __post_init__(self) -> None:
+        if not self.name.isidentifier() or self.name in NAMES:
+            raise ValueError(
+                f"name of a measurement is {self.name!r}, but it must be a Python identifier other than "
+                f"{', '.join(NAMES)}: give another name, such as 'wrench'"
+            )
+        if len(self.shape) not in (1, 3) or not all(type(size) is int and size >= 1 for size in self.shape):
+            raise ValueError(
+                f"measurement {self.name!r}: shape is {self.shape}, but it must be (size,) for a vector or (height, "
+                "width, channels) for an image"
+            )
+        for field in ("scale", "weight"):
+            if not 0 < getattr(self, field) < np.inf:
+                raise ValueError(f"measurement {self.name!r}: {field} is {getattr(self, field)}, but it must be > 0")
+        if self.is_image and self.scale != 1:
+            raise ValueError(
+                f"measurement {self.name!r}: scale is {self.scale}, but an image has values in [0, 1] and needs no "
+                "scale: leave out the argument scale"
+            )
+
+    @property
+    def is_image(self) -> bool:
+        """True for an image, False for a vector."""
+        return len(self.shape) == 3
+
+
+def measured(
+    measurements: Sequence[Measurement], data: Any, trajectories: np.ndarray, symmetries: Sequence[int]
+) -> dict[str, np.ndarray]:
+    """Measure the first and last frames of some trajectories, and of their turned and mirrored copies.
+
+    Args:
+        measurements: The specifications of the modalities.
+        data: The dataset, a `Dataset`.
+        trajectories: Indices of n trajectories, int `(n,)`.
+        symmetries: Numbers of the k symmetries of the copies (`dataset.symmetry`). Number 0 stands for the trajectory
+            itself.
+
+    Returns:
+        The values of each modality by name, uint8 or float32 `(n * k, 2, *shape)`. The k copies of a trajectory follow
+        each other.
+
+    Raises:
+        ValueError: Two measurements have the same name. The function `measure` or `turn` returns another shape or type
+            or, for an image, values outside [0, 1]. Copies are requested, but a measurement has no function `turn`.
+    """
+    names = [own.name for own in measurements]
+    if len(set(names)) < len(names):
+        raise ValueError(f"measurements has the names {names}, but each name may occur only once")
+    return {own.name: _measured(own, data, trajectories, symmetries) for own in measurements}
+
+
+def _measured(own: Measurement, data: Any, trajectories: np.ndarray, symmetries: Sequence[int]) -> np.ndarray:
+    """The values of one modality."""
+    if own.turn is None and any(symmetries):
+        raise ValueError(
+            f"measurement {own.name!r} has no function `turn`, which symmetries=True needs for the turned and mirrored "
+            "copies: give the measurement this function, or pass symmetries=False"
+        )
+    values = _checked(own, "measure", own.measure(data, trajectories), len(trajectories))
+    copies = [
+        values if own.turn is None or number == 0 else _checked(own, "turn", own.turn(values, number), len(values))
+        for number in symmetries
+    ]
+    return np.stack(copies, axis=1).reshape(-1, *values.shape[1:])
+
+
+def _checked(measurement: Measurement, function: str, values: Any, count: int) -> np.ndarray:
+    """Check the result of a function of the measurement, and return it as uint8 or float32."""
+    values, wanted = np.asarray(values), (count, 2, *measurement.shape)
+    start = f"measurement {measurement.name!r}: the function `{function}` returned "
+    if values.shape != wanted:
+        raise ValueError(f"{start}an array of shape {values.shape}, but it must have shape {wanted}")
+    if measurement.is_image and values.dtype == np.uint8:
+        return values
+    if values.dtype.kind not in "fiu":
+        raise ValueError(f"{start}values of type {values.dtype}, but they must be numbers")
+    values = values.astype(np.float32)
+    if np.isinf(values).any():
+        raise ValueError(f"{start}infinite numbers, but a value must be finite, or NaN if it was not measured")
+    if measurement.is_image and (np.nanmin(values, initial=0) < 0 or np.nanmax(values, initial=0) > 1):
+        raise ValueError(
+            f"{start}an image with values from {np.nanmin(values):.3g} to {np.nanmax(values):.3g}, but floats must be "
+            "in [0, 1]: divide by 255 if the values are 8-bit, or return uint8"
+        )
+    return values

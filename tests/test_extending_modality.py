@@ -1,0 +1,327 @@
+"""A further modality from one specification, from the dataset to the table, as `docs/extending.md` shows."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from extending_page import blocks
+
+import sts_jax as sts
+from sts_jax import dataset, evaluation, mvae, training
+from sts_jax.dataset.symmetry import turn_wrench
+
+NOTHING = np.full((32, 32, 3), 178, np.uint8)  # image of the empty sensor
+
+
+def wrenches(data, trajectories):
+    return data.trajectory["wrench"][trajectories][:, [0, -1]]
+
+
+def turned(values, symmetry):
+    return np.asarray(turn_wrench(jnp.asarray(values), symmetry))
+
+
+WRENCH = dataset.Measurement("wrench", (6,), wrenches, unit="N", turn=turned)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("stands") / "dataset"
+    scenario = sts.physics.Perturbed(frames=4)
+    collection = dataset.Collection(
+        scenario, categories=("bottle",), num_objects=3, num_per_object=2, num_full=0, resolution=(16, 16)
+    )
+    dataset.collect(collection, sts.Sensor(), folder)
+    return dataset.load(folder)
+
+
+def test_pairs_have_the_measured_values_and_their_copies_turn(data):
+    rows = np.array([4, 1])
+    plain = data.pairs(rows, measurements=(WRENCH,))
+    np.testing.assert_array_equal(plain.measurements["wrench"], data.trajectory["wrench"][[4, 1]][:, [0, -1]])
+    assert np.abs(plain.measurements["wrench"]).max() > 0.1
+    copies = data.pairs(rows, symmetries=True, measurements=(WRENCH,))
+    assert len(copies.pose) == 16
+    for row, (trajectory, symmetry) in enumerate((t, s) for t in rows for s in range(8)):
+        assert copies.trajectory[row] == trajectory
+        expected = turned(data.trajectory["wrench"][trajectory][[0, -1]], symmetry)
+        np.testing.assert_allclose(copies.measurements["wrench"][row], expected, atol=1e-6)
+    assert len(copies.take(slice(3)).measurements["wrench"]) == 3
+    assert data.pairs(rows).measurements == {}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"measure": lambda data, rows: np.zeros((len(rows), 6))}, r"`measure` returned .* \(2, 6\).* \(2, 2, 6\)"),
+        ({"measure": lambda data, rows: np.full((len(rows), 2, 6), np.inf)}, "`measure` returned infinite numbers"),
+        ({"measure": lambda data, rows: np.full((len(rows), 2, 6), "a")}, "`measure` returned values of type <U1"),
+        ({"turn": None}, "'wrench' has no function `turn`, which symmetries=True needs"),
+        ({"turn": lambda values, symmetry: values[:, :1]}, r"`turn` returned an array of shape \(2, 1, 6\)"),
+    ],
+)
+def test_a_wrong_function_of_a_measurement_is_named(data, changes, message):
+    with pytest.raises(ValueError, match=message):
+        data.pairs(np.array([0, 1]), symmetries=True, measurements=(dataclasses.replace(WRENCH, **changes),))
+
+
+def test_an_image_outside_the_unit_interval_and_equal_names_are_refused(data):
+    heat = dataset.Measurement("heat", (4, 4, 1), lambda data, rows: np.full((len(rows), 2, 4, 4, 1), 37.0))
+    with pytest.raises(ValueError, match=r"'heat'.* returned an image with values from 37 to 37.*divide by 255"):
+        data.pairs(np.array([0]), measurements=(heat,))
+    with pytest.raises(ValueError, match=r"has the names \['wrench', 'wrench'\]"):
+        data.pairs(np.array([0]), measurements=(WRENCH, WRENCH))
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"name": "pose"}, "name of a measurement is 'pose'"),
+        ({"name": "a b"}, "name of a measurement is 'a b'"),
+        ({"shape": (4, 4)}, r"shape is \(4, 4\)"),
+        ({"shape": (0,)}, r"shape is \(0,\)"),
+        ({"scale": 0.0}, "scale is 0.0, but it must be > 0"),
+        ({"weight": float("inf")}, "weight is inf"),
+        ({"shape": (32, 32, 3), "scale": 2.0}, "an image has values in"),
+    ],
+)
+def test_a_wrong_specification_is_named(fields, message):
+    with pytest.raises(ValueError, match=message):
+        dataset.Measurement(**{"name": "wrench", "shape": (6,), "measure": wrenches, **fields})
+
+
+# ---- Training and prediction. Load 2 follows from load 1, so that the truth is known. The images show nothing.
+
+
+def loads(data, rows):
+    """Load at rest (N): the first load times 3 minus 20."""
+    first = data[rows]
+    return np.stack([first, 3 * first - 20], axis=1)[..., None]
+
+
+LOAD = dataset.Measurement("load", (1,), loads, unit="N", scale=50.0, weight=100.0)
+
+
+def pairs_of(first, measurements=(LOAD,)):
+    """Pairs with empty images, whose measurements are computed from an array in place of a dataset."""
+    count = len(first)
+    pose = np.tile(np.array([0, 0, 0, 1, 0, 0, 0], np.float32), (count, 2, 1))
+    values = {own.name: own.measure(first, np.arange(count)).astype(np.float32) for own in measurements}
+    return dataset.Pairs(
+        visual=np.tile(NOTHING, (count, 2, 1, 1, 1)),
+        tactile=np.tile(NOTHING, (count, 2, 1, 1, 1)),
+        segmentation=np.zeros((count, 2, 32, 32), bool),
+        pose=pose,
+        contact=np.zeros((count, 2), bool),
+        condition=np.zeros((count, 0), np.float32),
+        outcome=np.zeros(count, np.int32),
+        object=np.arange(count, dtype=np.int32),
+        trajectory=np.arange(count),
+        support=np.zeros((count, 128), np.float32),
+        mass=np.zeros(count, np.float32),
+        com=np.zeros((count, 3), np.float32),
+        measurements=values,
+    )
+
+
+def trained(folder, pairs, measurements=(LOAD,), steps=300, modalities=()):
+    preprocessing = training.Preprocessing((32, 32))
+    arrays, preprocessing = training.frame_arrays(pairs, modalities, preprocessing, NOTHING, measurements=measurements)
+    model = training.paper_model(modalities, preprocessing, measurements=measurements)
+    model = dataclasses.replace(model, latent=8, hidden=32, widths=(4, 4, 4, 4))
+    training.save_blank(folder, NOTHING, NOTHING)
+    config = training.TrainConfig(
+        steps=steps, batch_size=50, learning_rate=1e-2, encoder_epsilon=1e-3, log_every=steps, checkpoint_every=steps
+    )
+    training.train(
+        config,
+        model,
+        arrays,
+        workdir=folder,
+        absent=preprocessing.absent,
+        preprocessing=dataclasses.asdict(preprocessing),
+    )
+    return sts.Predictor.load(folder)
+
+
+@pytest.fixture(scope="module")
+def predictor(tmp_path_factory):
+    first = np.random.default_rng(0).uniform(0, 100, 200).astype(np.float32)
+    return trained(tmp_path_factory.mktemp("load"), pairs_of(first))
+
+
+def test_a_predictor_takes_and_returns_a_measurement_in_its_unit(predictor, tmp_path):
+    first = np.random.default_rng(1).uniform(0, 100, (6, 4, 1)).astype(np.float32)
+    truth = 3 * first - 20
+    assert predictor.modalities == ("load",)
+    found = predictor(measurements={"load": first}, key=jax.random.key(0), num_samples=2)
+    assert np.mean((np.asarray(found.measurements["load"]) - truth) ** 2) < 0.05 * truth.var()
+    assert found.samples.measurements["load"].shape == (2, 6, 4, 1)
+    assert "load=float32[6, 4, 1]" in repr(found)
+    one = jax.jit(lambda x: predictor(measurements={"load": x}).measurements["load"])(jnp.asarray(first[0, 0]))
+    np.testing.assert_allclose(one, found.measurements["load"][0, 0], rtol=1e-4)
+    predictor.save(tmp_path / "copy")
+    again = sts.Predictor.load(tmp_path / "copy")(measurements={"load": first})
+    np.testing.assert_array_equal(again.measurements["load"], found.measurements["load"])
+
+
+def test_an_invalid_traced_measurement_gives_nan_in_its_item_alone(predictor):
+    values = jnp.array([[10.0], [jnp.nan], [30.0]])
+    call = jax.jit(lambda x: predictor(measurements={"load": x}, key=jax.random.key(0), num_samples=2))
+    found = call(values)
+    np.testing.assert_array_equal(np.isnan(found.measurements["load"][:, 0]), [False, True, False])
+    np.testing.assert_array_equal(np.isnan(found.samples.measurements["load"][1, :, 0]), [False, True, False])
+
+
+@pytest.mark.parametrize(
+    ("measurements", "message"),
+    [
+        ({"load": np.zeros(2, np.float32)}, r"load has shape \(2,\), but .* needs shape \(\.\.\., 1\)\.$"),
+        ({"load": np.full(1, np.nan, np.float32)}, "load has NaN or infinite values"),
+        ({"load": np.zeros(1, np.int32)}, r"load is int32, but it must be floating-point\.$"),
+        ({"sound": np.zeros(1, np.float32)}, "does not accept sound: the model was trained on load"),
+        ({"pose": np.zeros(7, np.float32)}, "measurements has the name 'pose': pass the argument pose"),
+        ([1.0], "measurements is a list, but it must be a dict"),
+        ({}, "nothing to predict from: give at least one of load"),
+    ],
+)
+def test_a_wrong_measurement_is_named(predictor, measurements, message):
+    with pytest.raises(ValueError, match=message):
+        # Without the run-time type checks of the tests, as users call it.
+        sts.Predictor.__call__.__wrapped__(predictor, measurements=measurements)
+
+
+def test_values_that_were_not_measured_are_masked():
+    def some(data, rows):
+        values = loads(data, rows)
+        values[0, 0], values[1, 1] = np.nan, np.nan
+        return values
+
+    def never_at_first(data, rows):
+        values = loads(data, rows)
+        values[:, 0] = np.nan
+        return values
+
+    part = dataclasses.replace(LOAD, measure=some)
+    late = dataclasses.replace(LOAD, name="late", measure=never_at_first)
+    pairs = pairs_of(np.array([10.0, 20.0, 30.0]), (part, late))
+    arrays, preprocessing = training.frame_arrays(
+        pairs, (), training.Preprocessing((32, 32)), NOTHING, measurements=(part, late)
+    )
+    assert preprocessing.absent == ("late",)
+    assert preprocessing.scales == (("load", 50.0), ("late", 50.0))
+    assert training.preprocessing_from_json(dataclasses.asdict(preprocessing)) == preprocessing
+    assert set(arrays.inputs) == {"load"}
+    np.testing.assert_array_equal(arrays.present["load"], [False, True, True])
+    np.testing.assert_array_equal(arrays.target_present["load"], [True, False, True])
+    np.testing.assert_allclose(arrays.targets["late"][:, 0], np.array([10, 40, 70]) / 50)
+
+    model = training.paper_model((), preprocessing, measurements=(part, late))
+    learner = training.learner(model, absent=preprocessing.absent)
+    learner.check(arrays)
+    graphdef, params, stats = learner.init(jax.random.key(0))
+
+    def loss(params, arrays):
+        batch = jax.tree.map(jnp.asarray, arrays.take(np.arange(3)))
+        return learner.loss(graphdef, params, stats, jax.random.key(1), batch, jnp.float32(1))[0]
+
+    filled = jax.tree.map(lambda x: np.nan_to_num(x, nan=123.0), vars(arrays))
+    values, gradients = zip(
+        *(jax.value_and_grad(loss)(params, own) for own in (arrays, training.Arrays(**filled))), strict=True
+    )
+    assert np.isfinite(values[0])
+    assert values[0] == values[1]
+    assert float(optax.tree.norm(gradients[0])) == pytest.approx(float(optax.tree.norm(gradients[1])), rel=1e-6)
+
+
+def test_measurements_are_scored_against_the_truth_and_the_baselines(predictor):
+    def sometimes(data, rows):
+        values = loads(data, rows)
+        values[0, 1] = np.nan
+        return values
+
+    first = np.array([10.0, 40.0, 80.0, 20.0], np.float32)
+    train, test = pairs_of(first[:2]), pairs_of(first, (dataclasses.replace(LOAD, measure=sometimes),))
+    metric = evaluation.measurement_error(LOAD)
+    scenario = sts.physics.Freefall()
+    rows = evaluation.baselines(scenario, train, test)
+    rows["model"] = evaluation.predict(predictor, ("load",), test, scenario)
+    judge = evaluation.scorer(scenario, train, metrics=(metric,))
+    scores = {name: judge(row, test) for name, row in rows.items()}
+    summary = evaluation.summarise(scores, test, metrics=(metric,), num=20)
+    truth = 3 * first[1:] - 20
+    found = {name: own["load_error"] and own["load_error"]["value"] for name, own in summary["predictors"].items()}
+    constant, copy, neighbour, below = evaluation.BASELINES
+    assert found[constant] == pytest.approx(np.abs(truth - 55).mean())  # 55: the mean of 3 * 10 - 20 and 3 * 40 - 20
+    assert found[copy] == pytest.approx(np.abs(truth - first[1:]).mean())
+    assert found[neighbour] == pytest.approx(np.abs(truth - 10).mean())  # all images are equal
+    assert found[below] is None
+    own = np.asarray(predictor(measurements={"load": first[:, None]}).measurements["load"])[1:, 0]
+    assert found["model"] == pytest.approx(np.abs(truth - own).mean(), rel=1e-4)
+    assert metric.title == "load error (N)"
+    with pytest.raises(ValueError, match="`test` lacks load: pass measurements"):
+        evaluation.predict(predictor, ("load",), test._replace(measurements={}), scenario)
+
+
+def test_an_item_without_a_measurement_is_predicted_from_the_prior(predictor):
+    def unknown(data, rows):
+        return np.full((len(rows), 2, 1), np.nan)
+
+    test = pairs_of(np.array([10.0, 90.0]), (dataclasses.replace(LOAD, measure=unknown),))
+    found = evaluation.predict(predictor, ("load",), test, sts.physics.Freefall())
+    np.testing.assert_allclose(
+        found.measurements["load"], np.asarray(predictor.prior((2,)).measurements["load"]), rtol=1e-5
+    )
+
+
+@pytest.mark.slow
+def test_a_further_image_is_predicted_in_the_unit_interval(tmp_path):
+    """The picture of the heat follows from the load."""
+
+    def heats(data, rows):
+        return np.round(2.55 * np.tile(data[rows][:, None, None, None, None], (1, 2, 32, 32, 1))).astype(np.uint8)
+
+    heat = dataset.Measurement("heat", (32, 32, 1), heats)
+    first = np.random.default_rng(0).uniform(0, 100, 100).astype(np.float32)
+    pairs = pairs_of(first, (LOAD, heat))
+    pairs = pairs._replace(measurements=pairs.measurements | {"heat": heats(first, np.arange(100))})
+    predictor = trained(tmp_path, pairs, (LOAD, heat), steps=200)
+    found = predictor(measurements={"load": np.array([[10.0], [90.0]], np.float32)}).measurements["heat"]
+    assert found.shape == (2, 32, 32, 1)
+    assert 0 <= float(found.min()) <= float(found.max()) <= 1
+    np.testing.assert_allclose(found.mean((1, 2, 3)), [0.1, 0.9], atol=0.1)
+    seen = predictor(measurements={"heat": pairs.measurements["heat"][:4, 0] / np.float32(255)}).measurements["load"]
+    np.testing.assert_allclose(seen[:, 0], 3 * first[:4] - 20, atol=40)
+    with pytest.raises(ValueError, match="heat has values in"):
+        predictor(measurements={"heat": np.full((32, 32, 1), 255.0, np.float32)})
+
+
+@pytest.mark.slow
+def test_the_code_of_the_page_trains_predicts_and_scores_a_force_and_a_sound(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(0)
+    sound = rng.uniform(-1, 1, (64, 16)).astype(np.float32)
+    pose = rng.uniform(-1, 1, (64, 12)).astype(np.float32)
+    names = {"pose": pose, "sound": sound, "pose_after": sound[:, :12], "sound_after": sound}
+    code = "\n".join(blocks("A further modality"))
+    assert code.count("steps=2000") == 2
+    exec(code.replace("steps=2000", "steps=4", 1), names)
+    assert names["predictor"].modalities == ("visual", "tactile", "pose", "force")
+    assert names["prediction"].measurements["force"].shape == (len(names["test"].pose), 3)
+    truth = names["data"].trajectory["wrench"][names["test"].trajectory][:, -1, :3]
+    copy = names["data"].trajectory["wrench"][names["test"].trajectory][:, 0, :3]
+    scored = names["summary"]["predictors"]["copy of the input"]["force_error"]["value"]
+    assert scored == pytest.approx(np.linalg.norm(truth - copy, axis=1).mean(), rel=1e-4)
+    assert "force error (N)" in capsys.readouterr().out
+    error = np.mean((np.asarray(names["predicted"]["pose"]) - sound[:8, :12]) ** 2)
+    assert error < 0.5 * np.mean((sound[:8, :12] - sound[:, :12].mean(0)) ** 2)
+
+
+def test_a_paper_model_without_further_modalities_is_unchanged():
+    preprocessing = training.Preprocessing((32, 32))
+    assert training.paper_model(("pose",), preprocessing).modalities == (
+        mvae.Modality("pose", "vector", (12,), weight=1000.0),
+    )
