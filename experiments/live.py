@@ -75,7 +75,7 @@ class Config:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Source:
-    """The source of the live images. Its sensor is not connected yet."""
+    """The source of the live images. The function that makes it does not connect the sensor."""
 
     name: str  # description for the title of the page
     sensor: hardware.STS | hardware.Replay  # device or recording
@@ -146,7 +146,7 @@ def opened(config: Config) -> Iterator[Source]:
 
 
 def replayed(config: Config) -> Source:
-    """Open the recording that `--replay` selects. Without `--sensor`, its own sensor file is used if there is one."""
+    """Open the recording that `--replay` selects. Without `--sensor`, the sensor file in the recording is used."""
     first, file = config.replay[0], config.sensor
     path = first if len(config.replay) == 1 else (first, config.replay[1])
     sensor = hardware.Replay(path, speed=config.speed, loop=config.loop)

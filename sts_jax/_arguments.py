@@ -46,8 +46,8 @@ def checked_array(name: str, value: Any, wanted: str) -> np.ndarray | Array:
         raise ValueError(f"{name} is not an array ({error}): give an array of {wanted}.") from error
     if array.dtype.kind in "OUSMm":
         raise ValueError(
-            f"{name} is a {type(value).__name__} that converts to a NumPy array of dtype {array.dtype}, but it must be "
-            f"an array of {wanted}."
+            f"{name} is a {type(value).__name__}, and its NumPy dtype is {array.dtype}, but it must be an array of "
+            f"{wanted}."
         )
     return array
 

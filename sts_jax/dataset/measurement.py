@@ -13,7 +13,7 @@ NAMES = ("visual", "tactile", "pose", "state")  # names of inputs that every dat
 class Measurement:
     """Specification of a further modality, such as the force on the pad or an image of a second camera.
 
-    This object is all that datasets, `mvae` models, `Predictor` and the evaluation need to know of the modality.
+    Datasets, `mvae` models, `Predictor` and the evaluation need no other information about the modality.
 
     Raises:
         ValueError: The name, the shape, the scale or the weight is not allowed.

@@ -174,8 +174,8 @@ class Connection:
     def _write(self, line: bytes) -> bool:
         """Write a line. Return False if the time `ports.WRITE_S` has passed.
 
-        On a computer with other work, pyserial reports this also for a line that it has sent, if the operating system
-        suspended the process meanwhile.
+        pyserial also reports a timeout for a line that it has sent, if the operating system suspended the process in
+        between. This happens on a busy computer.
         """
         try:
             self._serial.write(line)

@@ -98,7 +98,10 @@ def library(
     items, skipped = _walked(folder) if root is None else shapenet.items(root)
     if not items:
         reasons = "".join(f"\n  {name}: {reason}" for name, reason in skipped[:5])
-        raise ValueError(f"{folder}: the folder contains no usable mesh: give a folder with mesh files in it{reasons}")
+        raise ValueError(
+            f"{folder}: the folder contains no usable mesh, and {len(skipped)} files were skipped: give a folder with "
+            f"mesh files that `objects.load` can read{reasons}"
+        )
     if scale is not None or longest_side is not None:
         items = [dataclasses.replace(item, scale=scale, longest_side=longest_side, stated=None) for item in items]
     if up is not None:

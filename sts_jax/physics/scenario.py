@@ -117,6 +117,8 @@ class Scenario(abc.ABC):
     `quantities` describes them. The condition is an input of predictors, besides the first frame.
     """
 
+    # This is not a `typing.Protocol`. The command line calls `issubclass` to find the options of a scenario, and a
+    # protocol with fields raises an error there.
     __dataclass_fields__: ClassVar[dict[str, Any]]  # for type checkers: it is a dataclass
 
     # possible outcomes, the most informative first: members of `Outcome`, or of another IntEnum with numbers that

@@ -44,7 +44,8 @@ def weighted(
 ) -> list[Float[Array, "h w"]]:
     """For each pixel, multiply `corners.value` at the three corners of the visible face by the corners' weights.
 
-    The sum of the three products is the interpolated value. The arguments are those of the function `weights`.
+    The result is a list of the three products. The caller can add them to interpolate the value at the pixel. The
+    arguments are those of the function `weights`.
     """
     indices, shares = weights(corners, winner, column, row)
     return [share * corners.value[k] for share, k in zip(shares, indices, strict=True)]

@@ -172,9 +172,9 @@ class Twin:
         """
         if self._virtual_s:
             raise RuntimeError(
-                f"the virtual clock of this Twin has advanced to {self._virtual_s} s, but another clock can replace "
-                "the virtual clock only at 0 s: make a new Twin, and pass the new Twin to Served before any call of "
-                "`Twin.step`, `Twin.capture`, `Twin.set` or `Twin.ping`"
+                f"the virtual clock of this Twin is at {self._virtual_s} s, but Served needs a Twin whose virtual "
+                "clock is at 0 s, because Served replaces this clock: make a new Twin, and pass the new Twin to Served "
+                "before any call of `Twin.step`, `Twin.capture`, `Twin.set` or `Twin.ping`"
             )
         self._clock = clock
         self._boot(clock())
