@@ -9,10 +9,10 @@ No hardware is needed. The LED controller is emulated on a pseudo-terminal, and 
 exposure time. Before each fault the program reads a pair. Then the fault begins at a random moment of a read. Reads
 continue until a pair has been read after the end of the fault.
 
-The emulated camera logs the light during each exposure. By this log, an image is counted as wrong if it was taken under
-a wrong or mixed light, or if the camera never took it. An image is counted as old if its exposure began more than the
-settling time before the read. The settling time is the time from a switch of the lights to the first frame that shows
-only the new lights.
+The emulated camera logs the light during each exposure. The program counts a received image as wrong if the log shows a
+wrong or mixed light for its exposure, or if the log has no such exposure. An image is counted as old if its exposure
+began more than the settling time before the read. The settling time is the time from a switch of the lights to the
+first frame that shows only the new lights.
 
 In the last kind of fault, a second process reads the pairs, and the second process is killed while a light is on.
 """

@@ -4,9 +4,9 @@
 
 For each size, the command prints the time to render a pose, the time to make a noisy frame with the light on for half
 of the exposure, and the time to encode this frame as JPEG. The command also prints two frame rates, which are measured
-with the light off. The first is the rate at which the twin makes frames on its virtual clock, which does not wait for
-real time. The second is the rate at which a second process receives frames through OpenCV. All values are medians,
-and all processes run on one CPU core.
+with the light off. The first is the number of frames that the twin makes per second if it does not wait between frames.
+The second is the rate at which a second process receives frames through OpenCV. All values are medians, and all
+processes run on one CPU core.
 """
 
 import dataclasses

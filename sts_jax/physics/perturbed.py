@@ -52,8 +52,8 @@ class Perturbed(Scenario):
     The condition of a trajectory contains the acceleration of the pad along x and y (m/s^2) and its duration (s). The
     simulation runs in the frame of the pad, so the acceleration of the pad is subtracted from gravity.
 
-    The share of the interior that is filled (`fill`) matters most for objects with a narrow base. The default ranges of
-    the fields are therefore chosen for bottles.
+    The default ranges of the fields are chosen for bottles, which can contain water. Bottles have a narrow base, so the
+    share of a bottle that is filled (`fill`) often decides whether it topples.
 
     The random values of each trajectory, such as the friction, are drawn uniformly from the ranges that the fields of
     this class define. Source: the See-Through-your-Skin paper, section "Data Collection".

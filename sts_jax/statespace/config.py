@@ -102,9 +102,9 @@ class Config:
     def to_json(self) -> dict[str, Any]:
         """The fields by name, in values that `json.dumps` accepts.
 
-        The fields `vectors` and `outcome_names` are left out if they have their default values. Older versions saved
-        configurations without these fields. The result is therefore equal to the saved configuration of an older
-        version, and the training of the older version can be resumed.
+        A field that older versions of the library did not have (`vectors` or `outcome_names`) is left out if it has its
+        default value. A training that an older version began can therefore be resumed, because its saved configuration
+        equals the result.
         """
         values = dataclasses.asdict(self)
         return {name: value for name, value in values.items() if (name, value) not in _ADDED}

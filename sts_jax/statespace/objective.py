@@ -113,7 +113,7 @@ def _counted(counts: Bool[Array, "n"], values: Float[Array, "n ..."]) -> Float[A
 def log_density(
     final: FinalPose, code: Float[Array, "n 12"], turn: Float[Array, "n 3 3"], outcome: Int[Array, "n"]
 ) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
-    """Evaluate the predicted densities of n items at their true outcomes and final poses.
+    """Evaluate predicted probability densities at the true outcomes and final poses of n trajectories.
 
     Args:
         final: Densities of the final poses.
