@@ -152,7 +152,7 @@ def checked_samples(num_samples: Any, key: Any) -> int:
     return number
 
 
-Kind = Literal["image", "pose", "vector"]  # the kinds of inputs, which have different ranges
+Kind = Literal["image", "pose", "vector"]  # kinds of inputs. Each kind has its own range
 
 
 def plausible(kind: Kind, array: Float[Array, "..."]) -> Bool[Array, "*n"]:
@@ -178,7 +178,7 @@ def plausible(kind: Kind, array: Float[Array, "..."]) -> Bool[Array, "*n"]:
 
 
 def check_values(name: str, kind: Kind, array: np.ndarray) -> None:
-    """Check that all items of an input have finite numbers in the allowed range.
+    """Check that all numbers of an input are finite and in the range of its kind.
 
     Args:
         name: Name of the modality, for error messages.

@@ -23,8 +23,8 @@ _LARGEST_CONDITION = 100.0  # largest condition, as a multiple of its usual magn
 class Predictor:
     """A trained model as a function: `predictor(visual=image)` returns a `Prediction`.
 
-    The inputs are images and the object's pose in the first frame of a trajectory, and the further modalities of models
-    that have them (`dataset.Measurement`). The prediction is the last frame, in which the object has come to rest.
+    The inputs are images and the object's pose in the first frame of a trajectory. A model can have further inputs
+    (`dataset.Measurement`). The prediction is the last frame, in which the object has come to rest.
 
     `Predictor.load("freefall")` loads a model that comes with the library.
     `Predictor.load("runs/freefall/models/statespace")` loads a model that you trained. Calls are pure, and work inside
@@ -57,7 +57,7 @@ class Predictor:
         self._inputs = config.names if isinstance(config, mvae.Config) else config.inputs
         self._names = config.names if isinstance(config, mvae.Config) else MODALITIES
         size = (*preprocessing.resolution, 3)
-        # the kind and the shape of one item, for each input
+        # kind of each input, and shape of one item
         self._kinds: dict[str, _arguments.Kind] = {"visual": "image", "tactile": "image", "pose": "pose"}
         self._shapes: dict[str, tuple[int, ...]] = {"visual": size, "tactile": size, "pose": (7,)}
         if isinstance(config, mvae.Config):
@@ -182,8 +182,8 @@ class Predictor:
             state: Codes of the true pose, shape and mass, (*n, code), from `statespace.encode`. Only for state-space
                 models. With the true state of a simulation, the remaining error is that of the learned physics and of
                 the decoder.
-            measurements: Further modalities of the model by name, see `dataset.Measurement`: vectors of numbers in SI
-                units, (*n, size), or images in [0, 1], (*n, height, width, channels).
+            measurements: Values of further modalities (`dataset.Measurement`) by name: vectors in SI units, (*n, size),
+                or images in [0, 1], (*n, height, width, channels).
             present: Dictionary from the name of a modality to a Boolean mask (*n,), False for items in which the
                 modality is to be ignored. Ignored values may be NaN. By default, all items are used.
             key: Random key that draws the samples. It is needed only if `num_samples` > 0.
@@ -292,7 +292,7 @@ class Predictor:
 
     @property
     def modalities(self) -> tuple[str, ...]:
-        """Names of the inputs that the model accepts: some of "visual", "tactile" and "pose", and further modalities.
+        """Names of the inputs that the model accepts: any of "visual", "tactile", "pose" and further ones.
 
         The model accepts an input only if the first frame of at least one training trajectory contains this input.
         """
@@ -302,7 +302,7 @@ class Predictor:
     def outcomes(self) -> tuple[str, ...]:
         """Names of the outcomes in the order of `Prediction.outcome_probability`, such as ("rests", "fell off").
 
-        Empty for `mvae` models, and for state-space models of older versions, which do not store the names.
+        Empty for `mvae` models, and for state-space models of older versions that did not store the names.
         """
         config = self.model.config
         return config.outcome_names if isinstance(config, statespace.Config) else ()

@@ -32,7 +32,8 @@ class Prediction(NamedTuple):
     mean: Float[Array, "*n latent"]
     # Logarithm of the variance of this posterior.
     log_var: Float[Array, "*n latent"]
-    # Samples, None if `num_samples` is 0. Their images and poses have another leading axis of `num_samples`.
+    # Samples, None if `num_samples` is 0. Their images, poses and measurements have another leading axis of
+    # `num_samples`.
     samples: "Prediction | None" = None
     # Probability of each of the scenario's outcomes, in the order of `Predictor.outcomes`. None for an `mvae` model.
     outcome_probability: Float[Array, "*n outcomes"] | None = None
@@ -248,7 +249,7 @@ def _flat(
     lead: tuple[int, ...],
     blank: Float[Array, "h w 3"],
 ) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Encode all inputs, and return them and their masks with one leading axis. Touches without contact are masked."""
+    """Encode all inputs, and return them and their masks with one leading axis. Images without contact are masked."""
     flat, counts = {}, {}
     for name, value in inputs.items():
         value = preprocessing.encode(name, value)

@@ -139,14 +139,13 @@ def read_arrays(path: Path, remedy: str) -> dict[str, np.ndarray]:
 def claim(path: Path, content: dict, *, labels: tuple[str, ...] = ()) -> None:
     """Record settings in a JSON file, or check that an existing file has the same settings.
 
-    The check ensures that all results in a folder have the same settings. A field that the existing file lacks, because
-    an older version wrote it, counts as empty.
+    The check ensures that all results in a folder have the same settings. The existing file may lack a field if the new
+    value is an empty list or dictionary, or if `labels` contains the name of the field.
 
     Args:
         path: The file.
         content: The settings, of JSON types. Tuples count as lists.
-        labels: Dotted names of fields that an existing file may lack, such as `model.outcome_names`, because they do
-            not influence the results.
+        labels: Dotted names of fields that do not influence the results, such as `model.outcome_names`.
 
     Raises:
         ValueError: The settings in the existing file differ. The message names all fields that differ, and the remedy.

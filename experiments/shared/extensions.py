@@ -8,29 +8,29 @@ import optax
 
 from sts_jax import dataset, evaluation, mvae, statespace, training
 
-Log = Callable[[int, dict[str, float]], None]  # arguments: step of a record, its other numbers by name
+Log = Callable[[int, dict[str, float]], None]  # arguments: step of a record, other numbers of the record by name
 
 
 @dataclasses.dataclass(frozen=True)
 class Extensions:
-    """Your own parts of an experiment. A field with its default value stands for the part of the library.
+    """Your own parts of an experiment. The default of each field selects the library's own part.
 
-    Functions cannot be compared. A finished model or table is therefore not made again if the code of a function
-    changes. After such a change, use other `notes`, another name of the metric, or a new work directory.
+    Functions cannot be compared. A finished model or table is therefore not made again if the code of a loss, an
+    optimiser or a metric changes. After a change of the loss or the optimiser, use a new work directory. After a change
+    of a metric's function, rename the metric.
 
     Raises:
-        ValueError: Two metrics have the same name, or a column has a metric that `metrics` lacks.
+        ValueError: Two metrics have the same name, or a column uses a metric that is not in `metrics`.
     """
 
-    # Function of the configuration of a model that returns the loss of this model
+    # Function that receives the configuration of a model, and returns the loss for it
     loss: Callable[[mvae.Config | statespace.Config], training.Loss] | None = None
     # Optimiser of all models, in place of Adam with the options of the configuration
     optimiser: optax.GradientTransformation | None = None
     # JSON values that describe the loss and the optimiser. They are stored with each model, and a resumed training must
     # have the same notes
     notes: dict[str, Any] | None = None
-    # Function of the name of a model that returns a function of the step and the values of a record, as the argument
-    # `log` of `training.train`
+    # Function that receives the name of a model, and returns the argument `log` of `training.train` for it
     log: Callable[[str], Log] | None = None
     metrics: tuple[evaluation.Metric, ...] = evaluation.METRICS  # metrics of metrics.json and table-full.md
     columns: tuple[evaluation.Column, ...] = evaluation.COLUMNS  # columns of table.md
@@ -56,10 +56,10 @@ class Extensions:
         return (*self.metrics, *(evaluation.measurement_error(own) for own in self.measurements))
 
     def described(self) -> list[Any]:
-        """The metrics without their functions, the columns and the modalities, as JSON values for a checksum."""
+        """Describe the columns, the modalities, and the metrics (without their functions) as JSON values."""
         fields = [{name: str(x) for name, x in vars(metric).items() if not callable(x)} for metric in self.scored]
         columns = [[column.heading, [metric.name for metric in column.metrics]] for column in self.columns]
         return [fields, columns, [own.name for own in self.measurements]]
 
 
-NONE = Extensions()  # only parts of the library
+NONE = Extensions()

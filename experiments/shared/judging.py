@@ -114,7 +114,7 @@ def evaluate(
 
 
 def _inputs(config: Config, data: dataset.Dataset, workdir: Path, split: str, own: Extensions) -> dict[str, str]:
-    """The checksums of the configuration, the dataset, the models, and the metrics if they are not the default."""
+    """The checksums of the configuration, the dataset and the models, and of a user's own metrics and columns."""
     inputs = {"config.json": storage.digest(dataclasses.asdict(config)), "dataset": data.identity}
     for folder in (model_folder(workdir, name, config, split) for name in MODELS[config.model]):
         inputs[folder.relative_to(workdir).as_posix()] = results.identity(folder)

@@ -48,8 +48,8 @@ def ceilings(
 
     A re-roll is a new simulation from the first pose of a trajectory, with newly drawn hidden properties such as
     friction. The re-rolls are in `ceiling{suffix}.npz`. `ceiling{suffix}.json` records the checksums of the inputs of
-    the computation. If an input has changed, the re-rolls are computed again. A changed function of a metric is not
-    noticed, because functions cannot be compared.
+    the computation. If an input has changed, the re-rolls are computed again. A change in the code of a
+    metric has no effect on existing re-rolls, because functions cannot be compared.
 
     Args:
         workdir: Work directory.
@@ -61,7 +61,7 @@ def ceilings(
         times: Number of re-rolls of each trajectory.
         num: Number of trajectories with re-rolls.
         judge: Function that scores a prediction of the first `num` held-out trajectories (`evaluation.scorer`).
-        metrics: Metrics of `judge`.
+        metrics: Metrics that `judge` computes.
     """
     few = test.take(slice(num))
     record, path = workdir / f"ceiling{suffix}.json", workdir / f"ceiling{suffix}.npz"
@@ -71,8 +71,8 @@ def ceilings(
         "the re-rolls": storage.digest([times, SEED, FORMAT]),
     }
     further = sorted(metric.name for metric in metrics if metric.errors is not None)
-    if further:  # none of the library's metrics
-        inputs["the list of metrics with errors"] = storage.digest(further)
+    if further:  # the library's metrics have no `errors`
+        inputs["the list of metrics per trajectory"] = storage.digest(further)
     reason = results.stale(record, inputs)
     if reason is not None:
         if record.exists():

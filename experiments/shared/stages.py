@@ -29,14 +29,16 @@ def main(config: Config, workdir: Path, *, only: Stage | None = None, own: Exten
 
     Raises:
         ValueError: A field of the configuration is out of range, the work directory has another configuration, or a
-            model in it was trained with a loss or an optimiser that `own` lacks, or with other notes.
+            model in it was trained with another choice of loss or optimiser or with other notes. Also raised if
+            `own.measurements` is given for other models than the paper's.
         FileNotFoundError: A stage before `only` has not been run.
         LockedError: Another process works in the work directory.
     """
     check(config)
     if own.measurements and config.model != "paper":
         raise ValueError(
-            f"measurements has {own.measurements[0].name!r}, but only the paper's models accept further modalities: "
+            f"measurements has {own.measurements[0].name!r}, but only the paper's model with all modalities accepts "
+            "further modalities: "
             "choose a configuration with model='paper'"
         )
     sensor = sts.Sensor()
@@ -140,7 +142,8 @@ def jobs(
         views: Further images of the training objects. Only the state-space model uses them.
         falls: First and last poses in trajectories of the training objects, without images. Only the state-space model
             uses these poses.
-        measurements: Further modalities of the paper's model with all modalities. `pairs` must have their values.
+        measurements: Further modalities of the paper's model with all modalities. `pairs.measurements` must contain
+            their values.
     """
     preprocessing, scenario = preprocessing_of(config), config.collection.scenario
     frame = dataset.empty_frame(sensor, config.collection)

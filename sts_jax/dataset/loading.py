@@ -41,7 +41,7 @@ class Pairs(NamedTuple):
     measurements: dict[str, np.ndarray] = {}  # noqa: RUF012 (never changed)
 
     def take(self, rows: np.ndarray | slice) -> "Pairs":
-        """Return some of the trajectories.
+        """Select trajectories.
 
         Args:
             rows: Indices, a bool mask `(n,)`, or a slice such as `slice(10)` for the first ten.
@@ -310,8 +310,9 @@ class Dataset:
             measurements: Further modalities to measure. Their values are in `Pairs.measurements`.
 
         Raises:
-            ValueError: An index is not a whole number or is out of range, its trajectory has no images, or a function
-                of a measurement is missing or returns a wrong shape, type or value.
+            ValueError: An index is not a whole number or is out of range, or its trajectory has no images. Two
+                measurements have the same name, or a function of a measurement is missing or returns a wrong shape,
+                type or value.
             FileNotFoundError: A shard is missing.
             DamagedFileError: A shard is damaged. The message names it.
         """

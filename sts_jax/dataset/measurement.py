@@ -1,4 +1,4 @@
-"""Specifications of further modalities: measurements of a frame other than the two images and the pose."""
+"""Specifications of further modalities, in addition to the two images and the pose."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-NAMES = ("visual", "tactile", "pose", "state")  # names of inputs that every dataset has
+NAMES = ("visual", "tactile", "pose", "state")  # reserved names of the library's own inputs
 
 
 @dataclasses.dataclass(frozen=True)
 class Measurement:
-    """Specification of a further modality, such as the force on the pad or an image of a second camera.
+    """Specification of a further modality, such as the contact force or an image of a second camera.
 
     Datasets, `mvae` models, `Predictor` and the evaluation need no other information about the modality.
 
@@ -21,15 +21,15 @@ class Measurement:
 
     name: str  # name of the modality, other than `visual`, `tactile`, `pose` and `state`
     shape: tuple[int, ...]  # (size,) for a vector of numbers, or (height, width, channels) for an image in [0, 1]
-    # Function of a `Dataset` and of the indices of n trajectories. It returns the values in the first and last frames,
-    # `(n, 2, *shape)`: numbers in SI units, or images as floats in [0, 1] or as uint8. A value that was not measured is
-    # NaN in all its numbers. The models ignore such values.
+    # Function that receives a `Dataset` and the indices of n trajectories. It returns the values in the first and last
+    # frames, `(n, 2, *shape)`: numbers in SI units, or images as floats in [0, 1] or as uint8. If a value was not
+    # measured, its numbers are NaN. Training and evaluation ignore such values.
     measure: Callable[[Any, np.ndarray], np.ndarray]
     unit: str = ""  # SI unit of the numbers, for tables
     scale: float = 1.0  # typical size of the numbers (SI units). The networks receive the numbers divided by this size
     weight: float = 1.0  # weight of the reconstruction error in the loss of `mvae` models
-    # Function of values `(n, 2, *shape)` and of the number of a symmetry, 0 to 7 (`Dataset.pairs`), that returns the
-    # values in the turned or mirrored trajectories. It is needed only for `Dataset.pairs(..., symmetries=True)`.
+    # Function that receives values `(n, 2, *shape)` and the number of a symmetry, 0 to 7 (see `dataset.symmetry`). It
+    # returns the values in the turned or mirrored trajectories. Only `Dataset.pairs(..., symmetries=True)` needs it.
     turn: Callable[[np.ndarray, int], np.ndarray] | None = None
 
     def __post_init__(self) -> None:
@@ -45,7 +45,9 @@ class Measurement:
             )
         for field in ("scale", "weight"):
             if not 0 < getattr(self, field) < np.inf:
-                raise ValueError(f"measurement {self.name!r}: {field} is {getattr(self, field)}, but it must be > 0")
+                raise ValueError(
+                    f"measurement {self.name!r}: {field} is {getattr(self, field)}, but it must be > 0 and finite"
+                )
         if self.is_image and self.scale != 1:
             raise ValueError(
                 f"measurement {self.name!r}: scale is {self.scale}, but an image has values in [0, 1] and needs no "
@@ -71,21 +73,22 @@ def measured(
             itself.
 
     Returns:
-        The values of each modality by name, uint8 or float32 `(n * k, 2, *shape)`. The k copies of a trajectory follow
-        each other.
+        The values of each modality by name, uint8 or float32 `(n * k, 2, *shape)`. The k copies of a trajectory are
+        consecutive.
 
     Raises:
-        ValueError: Two measurements have the same name. The function `measure` or `turn` returns another shape or type
-            or, for an image, values outside [0, 1]. Copies are requested, but a measurement has no function `turn`.
+        ValueError: Two measurements have the same name. The function `measure` or `turn` returns a wrong shape or type,
+            infinite numbers, or image values outside [0, 1]. Copies are requested, but a measurement has no function
+            `turn`.
     """
     names = [own.name for own in measurements]
     if len(set(names)) < len(names):
-        raise ValueError(f"measurements has the names {names}, but each name may occur only once")
+        raise ValueError(f"measurements has the names {names}, but each name may occur only once: rename one")
     return {own.name: _measured(own, data, trajectories, symmetries) for own in measurements}
 
 
 def _measured(own: Measurement, data: Any, trajectories: np.ndarray, symmetries: Sequence[int]) -> np.ndarray:
-    """The values of one modality."""
+    """Measure one modality in all trajectories and copies."""
     if own.turn is None and any(symmetries):
         raise ValueError(
             f"measurement {own.name!r} has no function `turn`, which symmetries=True needs for the turned and mirrored "
@@ -108,13 +111,13 @@ def _checked(measurement: Measurement, function: str, values: Any, count: int) -
     if measurement.is_image and values.dtype == np.uint8:
         return values
     if values.dtype.kind not in "fiu":
-        raise ValueError(f"{start}values of type {values.dtype}, but they must be numbers")
+        raise ValueError(f"{start}values of type {values.dtype}, but they must be real numbers: return floats")
     values = values.astype(np.float32)
     if np.isinf(values).any():
         raise ValueError(f"{start}infinite numbers, but a value must be finite, or NaN if it was not measured")
     if measurement.is_image and (np.nanmin(values, initial=0) < 0 or np.nanmax(values, initial=0) > 1):
         raise ValueError(
-            f"{start}an image with values from {np.nanmin(values):.3g} to {np.nanmax(values):.3g}, but floats must be "
-            "in [0, 1]: divide by 255 if the values are 8-bit, or return uint8"
+            f"{start}an image with values from {np.nanmin(values):.3g} to {np.nanmax(values):.3g}, but an image must "
+            "have values in [0, 1] or the type uint8: divide by 255 if the values are 8-bit, or return uint8"
         )
     return values

@@ -1,4 +1,4 @@
-"""The metric of a further modality, made from its specification `dataset.Measurement`."""
+"""Makes the error metric of a further modality from its `dataset.Measurement`."""
 
 import numpy as np
 
@@ -8,13 +8,13 @@ from sts_jax.evaluation.records import Judged, Metric, Statistic, mean
 
 
 def measurement_error(measurement: Measurement) -> Metric:
-    """Make the metric that compares the predicted with the true values of a further modality in the last frame.
+    """Make the metric for the error of a further modality in the predicted last frame.
 
     Args:
         measurement: The specification of the modality.
 
     Returns:
-        The metric `NAME_error`. It is a mean over the held-out trajectories whose last frame was measured. For a
+        The metric `NAME_error`. It is a mean over the held-out trajectories with a true and a predicted value. For a
         vector, the error of a trajectory is the length of the difference vector, in the unit of the measurement. For an
         image, it is the mean absolute difference over all pixels and channels.
     """

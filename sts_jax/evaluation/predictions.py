@@ -82,7 +82,7 @@ class Forecaster(Protocol):
 
     @property
     def modalities(self) -> tuple[str, ...]:
-        """The inputs that the model accepts: some of `visual`, `tactile` and `pose`, and further modalities."""
+        """The inputs that the model accepts: any of `visual`, `tactile`, `pose` and further modalities."""
 
     @property
     def preprocessing(self) -> training.Preprocessing:
@@ -101,7 +101,7 @@ class Forecaster(Protocol):
     ) -> Any:
         """Predict from the inputs that are not None. See `sts_jax.Predictor` for the arguments.
 
-        If `modalities` has further modalities (`dataset.Measurement`), the model must also accept the arguments
+        If `modalities` contains further modalities (`dataset.Measurement`), the model must also accept the arguments
         `measurements` and `present` of `sts_jax.Predictor`.
 
         Returns:

@@ -30,8 +30,9 @@ def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str
       median of the heights of the training objects in their last frames, without the objects that leave the pad. The
       rule predicts no images.
 
-    The first three also predict the further modalities (`Pairs.measurements`). A value that was not measured is NaN in
-    the copy and in the nearest neighbour, and does not count in the mean of the constant.
+    The constant, the copy and the nearest neighbour also predict the further modalities (`Pairs.measurements`). The
+    constant is the mean over the measured values. The copy and the nearest neighbour predict NaN if the value that they
+    copy was not measured.
 
     Args:
         scenario: The scenario of the trajectories.
@@ -94,6 +95,6 @@ def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str
 
 
 def _mean(values: np.ndarray) -> np.ndarray:
-    """The mean over the items that were measured, or NaN if there is none."""
+    """The mean over the items that were measured, or NaN if no item was measured."""
     known = values[~np.isnan(values).reshape(len(values), -1).any(1)]
     return known.mean(0) if len(known) else np.full(values.shape[1:], np.nan)

@@ -103,8 +103,7 @@ class Config:
         """The fields by name, in values that `json.dumps` accepts.
 
         A field that older versions of the library did not have (`vectors` or `outcome_names`) is left out if it has its
-        default value. A training that an older version began can therefore be resumed, because its saved configuration
-        equals the result.
+        default value, so that the result equals a configuration that an older version saved.
         """
         values = dataclasses.asdict(self)
         return {name: value for name, value in values.items() if (name, value) not in _ADDED}

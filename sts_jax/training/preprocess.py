@@ -44,7 +44,7 @@ class Preprocessing:
     touch_level: bool = False  # subtract the median change first, so that a change of all light is not a contact
     absent: tuple[str, ...] = ()  # modalities that no training sample had as an input
     condition_scale: tuple[float, ...] = ()  # SI units, divisors of the numbers of the scenario's condition
-    # name and scale (SI units) of each further modality with a vector of numbers, see `dataset.Measurement`
+    # (name, scale) of each further modality that is a vector (`dataset.Measurement`), scale in SI units
     scales: tuple[tuple[str, float], ...] = ()
 
     def __post_init__(self) -> None:
@@ -129,7 +129,7 @@ class Preprocessing:
 
         Args:
             name: Name of the modality.
-            code: Output of the network. For images, it consists of logits.
+            code: Output of the network (logits for images).
 
         Returns:
             The result of `decode_pose` for the modality `pose`, the numbers of a further modality (SI units), or images

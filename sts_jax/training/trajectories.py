@@ -38,17 +38,17 @@ def frame_arrays(
         measurements: Further modalities of the model. `pairs.measurements` must have their values.
 
     Returns:
-        The arrays, and the preprocessing with new values of `absent` and `scales`. `absent` names the modalities that
-        are missing from the inputs of every sample, and the arrays have no such inputs. It contains `tactile` if no
-        first frame shows a contact, and a further modality if it was measured in no first frame. `scales` has the
-        scales of the further modalities.
+        The arrays, and the preprocessing with new values of `absent` and `scales`. `absent` lists the modalities that
+        no sample has as an input, and `arrays.inputs` omits them. It contains `tactile` if no first frame shows a
+        contact, and each further modality that was not measured in any first frame. `scales` contains the scale of each
+        further modality that is a vector.
 
     Raises:
         ValueError: `pairs.measurements` lacks a further modality.
     """
     lacking = [own.name for own in measurements if own.name not in pairs.measurements]
     if lacking:
-        raise ValueError(f"pairs.measurements lacks {', '.join(lacking)}: pass measurements=... to Dataset.pairs, too")
+        raise ValueError(f"pairs.measurements lacks {', '.join(lacking)}: pass the same measurements to Dataset.pairs")
     scales = tuple((own.name, own.scale) for own in measurements if not own.is_image)
     preprocessing = dataclasses.replace(preprocessing, scales=scales)
     code = np.asarray(_pose_codes(preprocessing, pairs.pose))
@@ -109,7 +109,7 @@ def _arrays(
     further: tuple[str, ...] = (),
 ) -> tuple[Arrays, Preprocessing]:
     """Make the training arrays of an `mvae` model from encoded first and last frames by modality."""
-    # The values of a further modality are NaN where it was not measured.
+    # NaN marks frames in which a further modality was not measured.
     known = {name: ~np.isnan(found[name]).reshape(*found[name].shape[:2], -1).any(-1) for name in further}
     present = {name: mask[:, 0] for name, mask in known.items() if not mask[:, 0].all()}
     if "tactile" in modalities:
@@ -131,7 +131,8 @@ def paper_model(
 ) -> mvae.Config:
     """Make the configuration of the networks in the See-Through-your-Skin paper.
 
-    In the loss, the weight of the reconstruction error is 1 for images and 1000 for the pose.
+    In the loss, the weight of the reconstruction error is 1 for images and 1000 for the pose. A further modality has
+    the weight `Measurement.weight`.
 
     Args:
         modalities: Modalities of the model, some of `visual`, `tactile` and `pose`.
