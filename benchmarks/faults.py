@@ -285,7 +285,7 @@ RECONNECTING = (
 
 
 def inject(bench: Bench, sensor: hardware.STS, kind: str, count: Count) -> None:
-    """Inject one fault, read pairs of images until the fault is over, and go on reading until a pair arrives.
+    """Inject one fault, and try to read pairs of images until the first pair arrives after the end of the fault.
 
     Args:
         bench: The emulated devices.

@@ -171,7 +171,7 @@ def shader(unknowns: dict[str, Array], *, near: bool) -> tuple[tactile.Phong, ta
 
 
 def changes(constants: tactile.Phong, lights: tactile.Lights | tactile.Leds, given: Pixels) -> Float[Array, "m p"]:
-    """Image of the pressed skin minus image of the flat skin, for each light alone and with the colour white.
+    """Image of the pressed skin minus image of the flat skin, for each light alone. All lights are white.
 
     The lights are vmapped, because the gradient of the shader's own loop over lights takes minutes to compile.
 

@@ -72,8 +72,8 @@ class Replay:
             raise ValueError(f"speed must be > 0 and finite, or None, got {speed}")
         if fps is not None and not isinstance(source, tuple):
             raise ValueError(
-                f"fps must be None for a recording, because its folder contains the time of each image, got {fps}: "
-                "leave fps out."
+                f"fps is {fps}, but it must be None for a recording, whose folder contains the time of each image: "
+                "leave out fps."
             )
         self._source, self._fps = source, fps
         self._speed, self._loop = speed, loop
