@@ -47,6 +47,10 @@ class Predictor:
             blank: Visual and tactile image of the untouched sensor, each uint8 (height, width, 3).
             name: Name or folder of the model, for error messages.
         """
+        if isinstance(model.config, mvae.Config):  # a vector without a scale was trained on its own numbers
+            vectors = [own.name for own in model.config.modalities if own.kind == "vector" and own.name != "pose"]
+            scales = tuple((name, dict(preprocessing.scales).get(name, 1.0)) for name in vectors)
+            preprocessing = dataclasses.replace(preprocessing, scales=scales)
         self.model = model
         self.preprocessing = preprocessing
         self.name = name
@@ -314,16 +318,17 @@ class Predictor:
 
     def _checked_name(self, name: str, value: Any) -> np.ndarray | Array:
         """Check the type and shape of the input `name`, and return it as float32. A traced value stays traced."""
+        argument = f"the argument {name}" if name in MODALITIES else f"measurements[{name!r}]"
         if name not in (*self._inputs, *self.preprocessing.absent):
             raise ValueError(
                 f"{self.name} does not accept {name}: the model was trained on {', '.join(self._inputs)}. Leave out "
-                f"the argument {name}."
+                f"{argument}."
             )
         if name in self.preprocessing.absent:
             raise ValueError(
                 f"{self.name} cannot use {name}: the input {name} was absent from all first frames of the training "
-                f"data (before a fall, for example, nothing touches the pad). Leave out the argument {name}, or use a "
-                "model of another scenario."
+                f"data (before a fall, for example, nothing touches the pad). Leave out {argument}, or use a model of "
+                "another scenario."
             )
         tail, is_image = self._shapes[name], self._kinds[name] == "image"
         array = _arguments.checked_array(name, value, "floats in [0, 1]" if is_image else f"{tail[0]} numbers")
@@ -335,7 +340,7 @@ class Predictor:
         if array.ndim < len(tail) or array.shape[array.ndim - len(tail) :] != tail:
             raise ValueError(
                 f"{name} has shape {array.shape}, but {self.name} needs shape (..., {', '.join(map(str, tail))})"
-                + (f": render with resolution={tail[:2]}." if is_image else ".")
+                + (f": render with resolution={tail[:2]}." if is_image and name in MODALITIES else ".")
             )
         if math.prod(array.shape) == 0:
             raise ValueError(f"{name} has shape {array.shape}, which contains no item: pass at least one item.")

@@ -68,6 +68,24 @@ def test_a_wrong_function_of_a_measurement_is_named(data, changes, message):
         data.pairs(np.array([0, 1]), symmetries=True, measurements=(dataclasses.replace(WRENCH, **changes),))
 
 
+def test_a_turn_may_change_its_argument_but_not_the_type(data):
+    def flipped(values, symmetry):
+        values *= -1
+        return values
+
+    plain = data.pairs(np.array([0]), measurements=(WRENCH,)).measurements["wrench"]
+    copies = data.pairs(np.array([0]), symmetries=True, measurements=(dataclasses.replace(WRENCH, turn=flipped),))
+    np.testing.assert_array_equal(copies.measurements["wrench"], np.concatenate([plain, *[-plain] * 7]))
+    black = dataset.Measurement(
+        "black",
+        (32, 32, 1),
+        lambda data, rows: np.zeros((len(rows), 2, 32, 32, 1), np.uint8),
+        turn=lambda values, symmetry: values / 255,
+    )
+    with pytest.raises(ValueError, match=r"'black'.* of the types float32 and uint8, but the types must be equal"):
+        data.pairs(np.array([0]), symmetries=True, measurements=(black,))
+
+
 def test_an_image_outside_the_unit_interval_and_equal_names_are_refused(data):
     heat = dataset.Measurement("heat", (4, 4, 1), lambda data, rows: np.full((len(rows), 2, 4, 4, 1), 37.0))
     with pytest.raises(ValueError, match=r"'heat'.* returned an image with values from 37 to 37.*divide by 255"):
@@ -259,6 +277,11 @@ def test_measurements_are_scored_against_the_truth_and_the_baselines(predictor):
     assert found[copy] == pytest.approx(np.abs(truth - first[1:]).mean())
     assert found[neighbour] == pytest.approx(np.abs(truth - 10).mean())  # all images are equal
     assert found[below] is None
+    late = test._replace(measurements={"load": np.where([[[True], [False]]], np.nan, test.measurements["load"])})
+    filled = evaluation.baselines(scenario, train, late)[copy].measurements["load"]
+    np.testing.assert_allclose(filled, 55)  # the first frames were not measured
+    few = evaluation.score(evaluation.first(rows["model"], 2), test, metrics=(metric,))
+    assert few.further["load_error"].shape == (2,)
     own = np.asarray(predictor(measurements={"load": first[:, None]}).measurements["load"])[1:, 0]
     assert found["model"] == pytest.approx(np.abs(truth - own).mean(), rel=1e-4)
     assert metric.title == "load error (N)"

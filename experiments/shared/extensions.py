@@ -59,7 +59,7 @@ class Extensions:
         """Describe the columns, the modalities, and the metrics (without their functions) as JSON values."""
         fields = [{name: str(x) for name, x in vars(metric).items() if not callable(x)} for metric in self.scored]
         columns = [[column.heading, [metric.name for metric in column.metrics]] for column in self.columns]
-        return [fields, columns, [own.name for own in self.measurements]]
+        return [fields, columns, [[own.name, own.shape, float(own.scale)] for own in self.measurements]]
 
 
 NONE = Extensions()

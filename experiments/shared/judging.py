@@ -81,7 +81,7 @@ def evaluate(
         times=config.rerolls,
         num=config.num_rerolled,
         judge=judge,
-        metrics=own.scored,
+        metrics=own.metrics,  # re-rolls have no further modalities
     )
     references = evaluation.baselines(scenario, pairs.train, test)
     scores = {**possible.scores, **{title: judge(row, test) for title, row in references.items()}}

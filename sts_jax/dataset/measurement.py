@@ -38,13 +38,18 @@ class Measurement:
                 f"name of a measurement is {self.name!r}, but it must be a Python identifier other than "
                 f"{', '.join(NAMES)}: give another name, such as 'wrench'"
             )
-        if len(self.shape) not in (1, 3) or not all(type(size) is int and size >= 1 for size in self.shape):
+        if (
+            not isinstance(self.shape, tuple)
+            or len(self.shape) not in (1, 3)
+            or not all(type(size) is int and size >= 1 for size in self.shape)
+        ):
             raise ValueError(
                 f"measurement {self.name!r}: shape is {self.shape}, but it must be (size,) for a vector or (height, "
                 "width, channels) for an image"
             )
         for field in ("scale", "weight"):
-            if not 0 < getattr(self, field) < np.inf:
+            value = getattr(self, field)
+            if not isinstance(value, int | float | np.number) or not 0 < value < np.inf:
                 raise ValueError(
                     f"measurement {self.name!r}: {field} is {getattr(self, field)}, but it must be > 0 and finite"
                 )
@@ -95,10 +100,18 @@ def _measured(own: Measurement, data: Any, trajectories: np.ndarray, symmetries:
             "copies: give the measurement this function, or pass symmetries=False"
         )
     values = _checked(own, "measure", own.measure(data, trajectories), len(trajectories))
-    copies = [
-        values if own.turn is None or number == 0 else _checked(own, "turn", own.turn(values, number), len(values))
-        for number in symmetries
-    ]
+    copies = [values]
+    if own.turn is not None:
+        copies = [
+            values if number == 0 else _checked(own, "turn", own.turn(values.copy(), number), len(values))
+            for number in symmetries
+        ]
+    kinds = {str(copy.dtype) for copy in copies}
+    if len(kinds) > 1:
+        raise ValueError(
+            f"measurement {own.name!r}: the functions `measure` and `turn` returned values of the types "
+            f"{' and '.join(sorted(kinds))}, but the types must be equal: return uint8 or floats in both"
+        )
     return np.stack(copies, axis=1).reshape(-1, *values.shape[1:])
 
 
@@ -112,7 +125,8 @@ def _checked(measurement: Measurement, function: str, values: Any, count: int) -
         return values
     if values.dtype.kind not in "fiu":
         raise ValueError(f"{start}values of type {values.dtype}, but they must be real numbers: return floats")
-    values = values.astype(np.float32)
+    with np.errstate(over="ignore"):
+        values = values.astype(np.float32)
     if np.isinf(values).any():
         raise ValueError(f"{start}infinite numbers, but a value must be finite, or NaN if it was not measured")
     if measurement.is_image and (np.nanmin(values, initial=0) < 0 or np.nanmax(values, initial=0) > 1):

@@ -14,7 +14,7 @@ def measurement_error(measurement: Measurement) -> Metric:
         measurement: The specification of the modality.
 
     Returns:
-        The metric `NAME_error`. It is a mean over the held-out trajectories with a true and a predicted value. For a
+        The metric `NAME_error`. It is a mean over the held-out trajectories whose last frame was measured. For a
         vector, the error of a trajectory is the length of the difference vector, in the unit of the measurement. For an
         image, it is the mean absolute difference over all pixels and channels.
     """

@@ -31,8 +31,8 @@ def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str
       rule predicts no images.
 
     The constant, the copy and the nearest neighbour also predict the further modalities (`Pairs.measurements`). The
-    constant is the mean over the measured values. The copy and the nearest neighbour predict NaN if the value that they
-    copy was not measured.
+    constant is the mean over the measured values. The copy and the nearest neighbour predict this mean if the value
+    that they copy was not measured.
 
     Args:
         scenario: The scenario of the trajectories.
@@ -66,7 +66,12 @@ def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str
     rests = train.outcome != int(physics.Outcome.FELL_OFF)
     below = test.pose[:, 0].copy()
     below[:, 2] = np.median(train.pose[rests if rests.any() else slice(None), 1, 2])
-    further = {name: in_unit(values) for name, values in train.measurements.items() if name in test.measurements}
+    further = {name: in_unit(x[:, 1]) for name, x in train.measurements.items() if name in test.measurements}
+    means = {name: _mean(last) for name, last in further.items()}
+
+    def filled(name: str, values: np.ndarray) -> np.ndarray:
+        return np.where(np.isnan(values), means[name], values)
+
     return {
         CONSTANT: Predicted(
             repeat(train.visual[:, 1].mean(0) / 255),
@@ -74,21 +79,21 @@ def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str
             repeat(mean_pose),
             np.full(num, majority),
             outcome_probability=repeat(frequency),
-            measurements={name: repeat(_mean(values[:, 1])) for name, values in further.items()} or None,
+            measurements={name: repeat(mean) for name, mean in means.items()} or None,
         ),
         COPY: Predicted(
             test.visual[:, 0] / 255,
             test.tactile[:, 0] / 255,
             test.pose[:, 0],
             outcome_of_pose(scenario, test.pose[:, 0], test.pose[:, 0]),
-            measurements={name: in_unit(test.measurements[name][:, 0]) for name in further} or None,
+            measurements={name: filled(name, in_unit(test.measurements[name][:, 0])) for name in further} or None,
         ),
         NEIGHBOUR: Predicted(
             train.visual[nearest, 1] / 255,
             train.tactile[nearest, 1] / 255,
             train.pose[nearest, 1],
             train.outcome[nearest],
-            measurements={name: values[nearest, 1] for name, values in further.items()} or None,
+            measurements={name: filled(name, last[nearest]) for name, last in further.items()} or None,
         ),
         BELOW: Predicted(pose=below, outcome=outcome_of_pose(scenario, test.pose[:, 0], below)),
     }

@@ -58,7 +58,10 @@ def score(
         ValueError: `outcome_probability` does not have one row per item and one column per outcome, or `errors` of a
             metric does not return one number per item.
     """
-    leaves = (predicted.visual, predicted.tactile, predicted.pose, predicted.outcome, predicted.outcome_probability)
+    leaves = (
+        *(predicted.visual, predicted.tactile, predicted.pose, predicted.outcome, predicted.outcome_probability),
+        *(predicted.measurements or {}).values(),
+    )
     count = next((len(leaf) for leaf in leaves if leaf is not None), len(test.object))
     test = test.take(slice(count))
     scores = _with_samples(_of_point(predicted, test), predicted, test)

@@ -236,7 +236,7 @@ def preprocessing_from_json(content: dict) -> Preprocessing:
         content["condition_scale"] = tuple(content.get("condition_scale", ()))  # older models have no condition
         content["scales"] = tuple((name, float(scale)) for name, scale in content.get("scales", ()))
         return Preprocessing(**content)
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
             f"{content!r} does not describe a preprocessing ({type(error).__name__}: {error}): train the model with "
             "training.train(..., preprocessing=dataclasses.asdict(p)), where p is a training.Preprocessing."

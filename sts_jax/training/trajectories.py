@@ -49,7 +49,7 @@ def frame_arrays(
     lacking = [own.name for own in measurements if own.name not in pairs.measurements]
     if lacking:
         raise ValueError(f"pairs.measurements lacks {', '.join(lacking)}: pass the same measurements to Dataset.pairs")
-    scales = tuple((own.name, own.scale) for own in measurements if not own.is_image)
+    scales = tuple((own.name, float(own.scale)) for own in measurements if not own.is_image)
     preprocessing = dataclasses.replace(preprocessing, scales=scales)
     code = np.asarray(_pose_codes(preprocessing, pairs.pose))
     found = {"visual": pairs.visual, "tactile": pairs.tactile, "pose": code}
@@ -147,7 +147,7 @@ def paper_model(
     images = {name: mvae.Modality(name, "image", shape, start=0.7) for name in ("visual", "tactile")}
     kept = [{**images, "pose": pose}[name] for name in modalities]
     kept += [
-        mvae.Modality(own.name, "image" if own.is_image else "vector", own.shape, weight=own.weight)
+        mvae.Modality(own.name, "image" if own.is_image else "vector", own.shape, weight=float(own.weight))
         for own in measurements
     ]
     return mvae.Config(tuple(kept), condition=len(preprocessing.condition_scale))
