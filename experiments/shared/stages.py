@@ -38,8 +38,7 @@ def main(config: Config, workdir: Path, *, only: Stage | None = None, own: Exten
     if own.measurements and config.model != "paper":
         raise ValueError(
             f"measurements has {own.measurements[0].name!r}, but only the paper's model with all modalities accepts "
-            "further modalities: "
-            "choose a configuration with model='paper'"
+            "further modalities: choose a configuration with model='paper'"
         )
     sensor = sts.Sensor()
     with storage.lock(workdir):
