@@ -95,7 +95,7 @@ def test_an_experiment_trains_and_scores_a_further_modality(tmp_path):
 
 def test_a_further_modality_of_a_state_space_model_is_refused_before_anything_is_collected(tmp_path):
     force = dataset.Measurement("force", (3,), lambda data, rows: None)
-    with pytest.raises(ValueError, match="measurements has 'force', but only the paper's model with all modalities accepts"):
+    with pytest.raises(ValueError, match="'force', but only the paper's model with all modalities accepts"):
         stages.main(freefall.SMOKE, tmp_path / "run", own=Extensions(measurements=(force,)))
     assert not (tmp_path / "run").exists()
 
