@@ -139,6 +139,18 @@ def test_read_never_returns_a_frame_that_was_served_before_the_call(server):
             assert server.served[number_of(frame.image)] > called
 
 
+def test_read_discards_frames_that_the_network_held_back(server):
+    with connected(server) as camera:
+        for _ in range(10):  # the period must be measured
+            camera.async_read()
+        server.mode = "held"
+        time.sleep(0.3)
+        threading.Timer(0.1, lambda: setattr(server, "mode", "live")).start()
+        called = time.monotonic()
+        frame = camera.read()
+        assert server.served[number_of(frame.image)] > called
+
+
 def test_async_read_returns_new_frames_in_order(server):
     with connected(server) as camera:
         frames_read = [camera.async_read() for _ in range(40)]
@@ -221,6 +233,33 @@ def test_frames_that_a_network_held_back_are_known():
         pace.arrived(time_s)
         held.append(pace.delayed)
     assert held == [10 <= i < 16 for i in range(20)]
+
+
+def test_frames_that_a_network_held_back_do_not_change_the_measured_rate():
+    pace = frames.Pace(None)
+    for time_s in [*0.1 * np.arange(10), *(5.0 + 0.002 * np.arange(41)), *(5.1 + 0.1 * np.arange(9))]:
+        pace.arrived(time_s)
+    assert pace.rate == pytest.approx(10, rel=0.01)
+    assert pace.dropped == 0
+
+
+def test_a_camera_that_becomes_faster_after_a_gap_is_measured_again():
+    pace = frames.Pace(None)
+    for time_s in [*0.1 * np.arange(10), *(1.5 + 0.02 * np.arange(100))]:
+        pace.arrived(time_s)
+    assert pace.rate == pytest.approx(50)
+    assert not pace.delayed
+
+
+def test_the_first_frame_after_an_interruption_may_have_waited():
+    pace, delayed = frames.Pace(10.0), []
+    for time_s in (0.0, 0.1, 0.2):
+        pace.arrived(time_s)
+    pace.interrupted()
+    for time_s in (3.0, 3.002, 3.1, 3.2):
+        pace.arrived(time_s)
+        delayed.append(pace.delayed)
+    assert delayed == [True, True, False, False]
 
 
 def test_jitter_is_not_counted_as_loss():

@@ -586,7 +586,7 @@ def test_firmware_executes_repeated_requests_once(simulated, monkeypatch):
 
         def damaged_write(line):
             damage["request"] -= 1
-            write(line if damage["request"] < 0 else line.replace(b"SET", b"SAT"))
+            return write(line if damage["request"] < 0 else line.replace(b"SET", b"SAT"))
 
         def damaged_line(until):
             line = next_line(until)

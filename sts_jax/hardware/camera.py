@@ -181,8 +181,9 @@ class Camera:
         """Return a frame whose exposure began after the start of this call.
 
         The first `CameraConfig.in_flight` frames that arrive after the start of the call are discarded, because their
-        exposure may have begun earlier. If the source is a video file, no frame is discarded, and the method returns
-        the oldest frame that has not been returned yet.
+        exposure may have begun earlier. Delayed frames (`Captured.delayed`) are discarded for the same reason. If the
+        source is a video file, no frame is discarded, and the method returns the oldest frame that has not been
+        returned yet.
 
         Args:
             timeout_ms: Longest wait (ms). None: `CameraConfig.timeout_s`. If the camera was lost before the call, this

@@ -110,11 +110,15 @@ class Pace:
         if last is None or time_s <= last:
             return 0
         period = 1 / self.rate if self.rate is not None else self._nominal
-        self._intervals.append(time_s - last)
         if period is None:
+            self._intervals.append(time_s - last)
+            self.delayed = False
             return 0
         periods = (time_s - last) / period
         self.delayed = periods > _LONG or (self.delayed and periods < _SHORT)
+        late_together = self.delayed and periods < _SHORT and self._gap is not None
+        if not late_together:  # the intervals between frames that a network held back are not those of the camera
+            self._intervals.append(time_s - last)
         missing = max(round((time_s - last) / period) - 1, 0)
         if missing:
             self._gap = _Gap(last, 1, missing, missing + _MADE_UP)
@@ -133,6 +137,7 @@ class Pace:
     def interrupted(self) -> None:
         """Exclude the interval before the next frame from the measured period and from the count of lost frames.
 
-        Call this method after an interruption of the connection.
+        Call this method after an interruption of the connection. The next frame counts as delayed, because it may have
+        waited in a buffer while the connection was opened.
         """
-        self._last, self._gap, self.delayed = None, None, False
+        self._last, self._gap, self.delayed = None, None, True

@@ -194,7 +194,7 @@ class Grabber:
                 while self._queue:
                     frame = self._queue.popleft()
                     self._changed.notify_all()  # the queue has room for the next frame of a file
-                    if frame.sequence >= first:
+                    if frame.sequence >= first and not (exposed_now and frame.delayed):
                         return frame
                 if self._stop.is_set():
                     raise CameraNotConnectedError(
