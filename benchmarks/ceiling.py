@@ -6,11 +6,11 @@
 
 A start is the initial state of a trajectory. A re-roll is another simulation from the same start, with new random
 values of the hidden properties, such as friction and mass. The command uses the metrics and the held-out starts of the
-scenario's experiment. The command prints the errors of three predictions:
+scenario's experiment. The command prints the errors of these predictions:
 
 - the mean of the re-rolls, which is the best prediction from shape, pose and condition (such as the jerk of the pad)
 - the last frame of a single re-roll. Its image is as sharp as a true image
-- the baselines
+- the baselines, which are simple predictions without a model, such as a copy of the first frame
 
 Below the tables, the command prints how far the final poses of one start lie apart. Without `--workdir`, the dataset is
 collected into a temporary folder. With `--workdir`, missing parts of that run's dataset are collected in the run's
@@ -60,15 +60,16 @@ class Args:
 
 
 def spread(start: np.ndarray, end: np.ndarray, outcome: np.ndarray) -> list[str]:
-    """Describe how far the final poses lie from their start and from each other.
+    """Summarise how much repeated simulations of the same start differ.
 
     Args:
         start: First poses, `(n, 7)`.
         end: Last poses of the repeated simulations of each start, `(times, n, 7)`.
-        outcome: Outcome of each simulation, int `(times, n)`.
+        outcome: Number of the `physics.Outcome` of each simulation, such as `FELL_OFF`, int `(times, n)`.
 
     Returns:
-        Four lines of text.
+        Four lines of text: the number of starts, the distance of the last positions from the first position, their
+        distance from the mean last position of the same start, and the share of starts with several outcomes.
     """
     times = len(end)
     place, stays = 1e3 * end[..., :2], outcome != int(sts.physics.Outcome.FELL_OFF)

@@ -80,12 +80,12 @@ def make(name: str) -> objects.Body:
 
 
 def places(body: objects.Body, rng: np.random.Generator, kind: str) -> tuple[jax.Array, jax.Array]:
-    """Draw a random pose of an object, and the wrench of the pad on the object.
+    """Sample a random pose of an object, and compute the wrench of the pad on the object.
 
     Args:
         body: The object.
         rng: Source of the random pose.
-        kind: One of `POSES`.
+        kind: One of `POSES`: `touching` (the pad), `above` (the pad), or `out of view` (in part).
 
     Returns:
         The pose `(7,)` and the wrench `(6,)`. For the kind `touching`, the wrench is due to a force of 1 N upwards at
@@ -110,12 +110,12 @@ def places(body: objects.Body, rng: np.random.Generator, kind: str) -> tuple[jax
 
 
 def cases(body: objects.Body, seed: int, numbers: Sequence[int] = NUM_POSES) -> Iterator[tuple[jax.Array, jax.Array]]:
-    """Sample random poses of an object, and the wrench of the pad on the object in each pose.
+    """Sample random poses of an object, and compute the wrench of the pad on the object in each pose.
 
     Args:
         body: The object.
         seed: Seed of the random poses.
-        numbers: Number of poses of each kind in `POSES`.
+        numbers: Number of poses that touch the pad, that are above the pad, and that are partly out of view.
 
     Yields:
         A pose `(7,)` and its wrench `(6,)`, see `places`.
@@ -154,7 +154,7 @@ def difference(depth: np.ndarray, truth: np.ndarray) -> Difference:
 
 
 def total(differences: Sequence[Difference]) -> Difference:
-    """Sum the numbers of pixels of several images, and keep the largest interior error."""
+    """Combine the differences of several images: sum the pixel counts, and take the largest of the interior errors."""
     added = {name: sum(getattr(d, name) for d in differences) for name in Difference._fields if name != "worst"}
     return Difference(**added, worst=max(d.worst for d in differences))
 
@@ -169,11 +169,11 @@ def measure(
     Args:
         names: Names of the objects, from `PROCEDURAL`, `LOADED` and `MADE`.
         shape: Height and width of the images (pixels).
-        numbers: Number of poses of each kind in `POSES`.
+        numbers: Number of poses that touch the pad, that are above the pad, and that are partly out of view.
         first_seed: Offset of the seeds of the random poses.
 
     Returns:
-        The differences by name of the object.
+        The differences by name of the object. The differences of all images of an object are combined by `total`.
     """
     sensor = sts.Sensor()
     sense = jax.jit(lambda *inputs: sts.sense(sensor, *inputs, resolution=shape))
@@ -191,7 +191,7 @@ def measure(
 
 
 def describe(d: Difference) -> str:
-    """Format the differences between two depth images as one row of the printed table."""
+    """Format the differences from embree's depth, of one or more images together, as one row of the printed table."""
     rest = max(d.elsewhere, 1)
     return (
         f"{d.interior:9} {100 * (1 - d.interior_beyond_10um / max(d.interior, 1)):9.4f} {d.interior_beyond_100um:7} "

@@ -4,10 +4,12 @@
     python -m benchmarks.deterministic runs/perturbed --scenario perturbed --seconds 480
 
 Trains a convolutional network without latent variables on the dataset of a run. The inputs of the network are the
-first images, the first pose and the condition. The loss contains the cross-entropies of the last visual image, of the
-last tactile image and of the outcome, and the squared error of the final pose. Only trajectories with images are used.
-For a comparison at equal cost, set `--seconds` to the training time of the run's state-space model. Prints the errors
-of the network and of the baselines. Missing parts of the run's dataset are collected, and no other files are written.
+first images, the first pose and the condition. The condition consists of known quantities of the scenario, such as the
+acceleration of the pad. The loss contains the cross-entropies of the last visual image, of the last tactile image and
+of the outcome (how the trajectory ends, such as `FELL_OFF`), and the squared error of the final pose. Only trajectories
+with images are used. For a comparison at equal cost, set `--seconds` to the training time of the run's state-space
+model. Prints the errors of the network and of the baselines, which are simple predictions without a model. Missing
+parts of the run's dataset are collected, and no other files are written.
 """
 
 import dataclasses
@@ -49,7 +51,8 @@ class Args:
 class Network(nnx.Module):
     """Predicts the last images (64x64), pose and outcome from the first images (128x128), pose and condition.
 
-    Poses are encoded as pose codes of 12 numbers, see `training.Preprocessing.encode_pose`.
+    The condition consists of known quantities of the trajectory, such as the acceleration of the pad. Poses are encoded
+    as pose codes of 12 numbers, see `training.Preprocessing.encode_pose`.
     """
 
     def __init__(self, images: int, numbers: int, outcomes: int, rngs: nnx.Rngs) -> None:
@@ -100,7 +103,8 @@ def features(inputs: dict[str, Array], condition: Array | None, empty: dict[str,
     Args:
         inputs: The key `pose` has the encoded poses, `(n, 12)`. The key `visual` has the visual images, uint8
             `(n, 128, 128, 3)`. The optional key `tactile` has the tactile images, in the same shape.
-        condition: Condition of each item, `(n, c)`. None: the scenario has no condition.
+        condition: Encoded known quantities of each trajectory, such as the acceleration of the pad, `(n, c)`. None: the
+            scenario has none.
         empty: Images of the untouched sensor under the keys `visual` and `tactile`, uint8.
 
     Returns:
@@ -138,7 +142,7 @@ def fit(
         arrays: Training data.
         network: Definition of the network.
         params: Initial parameters of the network. They cannot be used afterwards.
-        seconds: Duration of the training after the first step, which compiles.
+        seconds: Duration of the training (s) without the first step, which includes the compilation.
         seed: Seed of the order of the batches.
 
     Returns:
@@ -167,13 +171,13 @@ def fit(
 def predict(
     graphdef: nnx.GraphDef[Network], params: nnx.State, job: stages.Job, arrays: training.Arrays
 ) -> evaluation.Predicted:
-    """Predict the last images, pose and outcome of every item.
+    """Predict the last images, pose and outcome of every trajectory.
 
     Args:
         graphdef: Definition of the network.
         params: Trained parameters of the network.
         job: The training job of the run. Its preprocessing decodes the predicted poses.
-        arrays: The items.
+        arrays: The trajectories. The targets in these arrays are not used.
     """
 
     @jax.jit

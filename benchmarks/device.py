@@ -5,9 +5,10 @@
     python -m benchmarks.device --pairs 1000 --twin                                              # the digital twin
     python -m benchmarks.device --pairs 10 --lags-ms 15
 
-No hardware is needed. A separate process emulates the LED controller on a pseudo-terminal and the camera on a local
-network port. The emulated images are of one colour (`instruments/sensor_peer.py`). With `--twin` they are images of the
-digital twin (`instruments/twin_peer.py`), whose object is held or released after every ten pairs.
+A pair is a visual image (light off) and a tactile image (light on). No hardware is needed. A separate process emulates
+the LED controller on a pseudo-terminal and the camera on a local network port. The emulated images are of one colour
+(`instruments/sensor_peer.py`). With `--twin` they are images of the digital twin (`instruments/twin_peer.py`), whose
+object is held or released after every ten pairs.
 
 The lag of a camera is the time from the end of a frame's exposure to the sending of the frame. The emulated camera has
 several lags in turn, and `hardware.STS` reads an equal share of the pairs at each lag. At each lag, `hardware.STS` also
@@ -78,12 +79,12 @@ class Measured(NamedTuple):
 
     @property
     def rate(self) -> float:
-        """Pairs per second."""
+        """Measured number of pairs per second."""
         return self.pairs / self.seconds
 
     @property
     def limit(self) -> float:
-        """Pairs per second that the camera allows."""
+        """Largest possible number of pairs per second, `1 / (2 / FPS + mean of the two settling times)`."""
         return 1 / (2 / FPS + (self.settling.visual_s + self.settling.tactile_s) / 2)
 
 
@@ -179,7 +180,7 @@ def measure_all(args: Args) -> list[Measured]:
 
 
 def main(args: Args) -> str:
-    """Read pairs of images with each delay of the camera (`--lags-ms`), and return a table of the results.
+    """Read pairs of images at each lag of the camera (`--lags-ms`), and return a table of the results.
 
     If `--out` is given, the table is also written to this file.
     """

@@ -4,10 +4,11 @@
     python -m benchmarks.faults --out benchmarks/results/hardware/faults.txt    # also write the table
     python -m benchmarks.faults --number 20 --only black                        # one kind of fault
 
-No hardware is needed. The LED controller is emulated on a pseudo-terminal, and the camera on a local network port
-(`instruments/sensor_peer.py`). The emulated camera sees the lights of the controller, with a random lag and a random
-exposure time. Before each fault the program reads a pair. Then the fault begins at a random moment of a read. Reads
-continue until a pair has been read after the end of the fault.
+A pair is a visual image (lights off) and a tactile image (lights on). No hardware is needed. The LED controller is
+emulated on a pseudo-terminal, and the camera on a local network port (`instruments/sensor_peer.py`). The emulated
+camera sees the lights of the controller. It has a random exposure time and a random lag, the time from the end of an
+exposure to the sending of the frame. Before each fault the program reads a pair. Then the fault begins at a random
+moment of a read. Reads continue until a pair has been read after the end of the fault.
 
 The emulated camera logs the light during each exposure. The program counts a received image as wrong if the log shows a
 wrong or mixed light for its exposure, or if the log has no such exposure. An image is counted as old if its exposure
@@ -138,7 +139,7 @@ class Bench:
                 yield sensor
 
     def camera(self) -> hardware.CameraConfig:
-        """The camera's configuration."""
+        """The configuration with which `hardware.STS` opens the emulated camera."""
         return hardware.CameraConfig(
             self.peer.url,
             *self.peer.camera.size,
@@ -149,7 +150,7 @@ class Bench:
         )
 
     def plug_in(self, name: str) -> None:
-        """Plug in the emulated controller, whose port is the symbolic link `name` in the folder of this bench."""
+        """Plug in the emulated controller. Its port is then the symbolic link `name` in the folder of this bench."""
         self.peer.plug_in(self.folder / name)
         self.ports[:] = [_usb_port(str(self.folder / name))]
 
@@ -287,11 +288,13 @@ RECONNECTING = (
 def inject(bench: Bench, sensor: hardware.STS, kind: str, count: Count) -> None:
     """Inject one fault, and try to read pairs of images until the first pair arrives after the end of the fault.
 
+    If no pair arrives in time (RETURN_S), the fault is not counted as recovered.
+
     Args:
         bench: The emulated devices.
         sensor: The connected sensor.
         kind: Kind of the fault, a name in `KINDS`.
-        count: Results of this kind, which are updated.
+        count: Results for this kind of fault. This function updates them.
     """
     count.injected += 1
     count.limit_s = RECONNECTED_S if kind in RECONNECTING or kind.startswith(("answer", "request")) else READ_S
@@ -373,9 +376,9 @@ def kill(bench: Bench, count: Count) -> None:
         _until(lambda: time.monotonic() > wait_s and lights.off_after(0.0) is None, 60)
         if process.poll() is not None or lights.off_after(0.0) is not None:
             raise RuntimeError(
-                "the benchmark waits until a light is on and then kills the program that reads the sensor, but no "
-                "light turned on in time, or the program ended early: the program's exit status is "
-                f"{process.poll()} (None if it still runs)"
+                "the benchmark kills the program that reads the sensor while a light is on, but no light was on within "
+                f"60 s, or the program ended too early. The exit status of the program is {process.poll()} (None: the "
+                "program still runs). If the status is a number, see the program's error output above"
             )
         process.send_signal(signal.SIGKILL)
         process.wait()

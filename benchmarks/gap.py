@@ -4,17 +4,19 @@
     python -m benchmarks.gap --out benchmarks/results/gap/known.txt           # also write the table
 
 No hardware is needed. The digital twin with its default imperfections (noise, vignetting, leaking light, JPEG, fisheye
-lens) takes the place of the real sensor. A second twin with almost no imperfections is the simulation ("clean"). Both
-twins run on a virtual clock with equal seeds, and the benchmark stops if their logs show different poses. The benchmark
-records two sessions, `WORKDIR/device` with its sensor file `WORKDIR/sensor.json`, and `WORKDIR/clean`. After
-the benchmark, run this command to compare the two sessions (with the default `WORKDIR`):
+lens) takes the place of the real sensor. A second twin ("clean") has almost no imperfections and takes the place of the
+simulation. Both twins run on a virtual clock with equal seeds, and the benchmark stops if their logs show different
+poses. The benchmark records two sessions, which are folders of images: `WORKDIR/device` with its sensor file
+`WORKDIR/sensor.json`, and `WORKDIR/clean`. After the benchmark, run this command to compare the two sessions (with the
+default `WORKDIR`):
 
     python -m experiments.gap --real runs/gap-twin/device --sensor runs/gap-twin --simulated runs/gap-twin/clean
 
-The first two rows of the benchmark's table compare images that differ by chance only: the two halves of the clean
-session, and two draws of the twin's noise. Each further row compares the images of the clean session with the same
-images after a known change: one added imperfection or, in the last row, all default imperfections. The distances are
-the mean absolute error of the pixels, the energy distance of image features, and the accuracy of a classifier.
+The first two rows of the benchmark's table compare images that differ by chance only. The first row compares the two
+halves of the clean session. The second row compares two copies of the clean session with all default imperfections,
+which differ only in the random noise. Each further row compares the images of the clean session with the same images
+after a known change: one added imperfection or, in the last row, all default imperfections. The distances are the mean
+absolute error of the pixels, the energy distance of image features, and the accuracy of a classifier.
 """
 
 import contextlib
@@ -132,7 +134,10 @@ def recording(folder: Path, note: str) -> Iterator[hardware.Session]:
 
 
 def record(device: twin.Twin, folder: Path, count: int, note: str, bar: Bar) -> list[tuple[float, ...]]:
-    """Record trajectories of the twin: a pair of images of the held object, and a pair of the object at rest.
+    """Record trajectories of the twin.
+
+    A trajectory consists of two pairs of images. A pair is a visual and a tactile image. The first pair shows the held
+    object, and the second pair shows the object at rest.
 
     Args:
         device: The twin.
@@ -173,6 +178,9 @@ def record(device: twin.Twin, folder: Path, count: int, note: str, bar: Bar) -> 
 
 def sessions(args: Args) -> hardware.Recordings:
     """Record the sessions `device` and `clean`, save the sensor file of `device`, and return the recordings of `clean`.
+
+    The twin of the session `device` has the default imperfections and a fisheye lens. The twin of the session `clean`
+    has almost no imperfections.
 
     Raises:
         AssertionError: The poses of the object differ between the two sessions.
@@ -271,7 +279,7 @@ def row(name: str, first: gap.Streams, second: gap.Streams, *, matched: bool) ->
         name: Name of the row.
         first: First set.
         second: Second set.
-        matched: The images of both sets show the same scenes in the same order, so that pixels can be compared.
+        matched: True if both sets show the same scenes in the same order, so that their pixels can be compared.
     """
     words = [f"{name:36s}"]
     for stream in ("visual", "tactile"):
@@ -310,6 +318,9 @@ def table(clean: gap.Streams, resolution: tuple[int, int]) -> Iterator[str]:
 
 def main(args: Args) -> None:
     """Record the sessions `device` and `clean`, then print the table of distances.
+
+    The sessions contain images of the same scenes. The images of `device` have the default imperfections of the digital
+    twin, and the images of `clean` have almost none. The table compares the clean images with changed copies of them.
 
     Raises:
         ValueError: An option is out of range, or the work directory contains trajectories already.

@@ -15,8 +15,9 @@ object starts on a tilted pad or just above it. The parts are:
   on which the contents lie.
 - `truth`: the log loss of two classifiers of the outcome. On the jerked pad, the inputs of the first classifier are the
   exact shape, the first pose and the jerk. On the slope, the inputs are the exact shape and the first pose with the
-  noise `slope_features.SEEN`. The second classifier has a noisy measurement of touch as a further input: the weight on
-  the jerked pad, or the centre of pressure on the slope. The gain is the relative decrease of the loss.
+  noise of an estimate from images (`slope_features.SEEN`). The second classifier has a noisy measurement of touch as a
+  further input: the weight on the jerked pad, or the centre of pressure on the slope. The gain is the relative decrease
+  of the loss.
 - `pictures`: as `truth`, but a small network estimates the measurement of touch from the first uint8 tactile image. The
   network is trained on other objects.
 - `fill`: the AUC of a small network that separates objects that are more than half full from emptier objects. The
@@ -53,7 +54,7 @@ EXAMPLES = 8  # starts of each object on which networks are trained
 
 @dataclasses.dataclass(frozen=True)
 class Study:
-    """The settings of the study of one scenario."""
+    """The settings with which the benchmark studies one scenario, such as the classes of the objects."""
 
     parts: tuple[Part, ...]  # parts that exist for the scenario
     scenario: physics.Scenario
@@ -133,8 +134,9 @@ class Args:
 def outcomes(study: Study, starts: Starts) -> None:
     """Print the shares of outcomes, of unsettled starts, and of starts whose outcome changes with other contents.
 
-    A start is the initial state of a trajectory. It is unsettled if its object is still on the pad and not at rest at
-    the end of the trajectory. The other contents have a new random fill level and, on the slope, lie on a new side.
+    A start is the initial state of a trajectory. The outcome is how the trajectory ends, such as by toppling. A start
+    is unsettled if its object is still on the pad and not at rest at the end of the trajectory. The other contents have
+    a new random fill level and, on the slope, lie on a new side.
     """
     share = functools.partial(classifier.interval, classifier.mean, groups=starts.body)
     for outcome in study.scenario.outcomes:
@@ -149,13 +151,14 @@ def outcomes(study: Study, starts: Starts) -> None:
 
 
 def losses(study: Study, items: list[objects.Body], starts: Starts, touch: np.ndarray | None) -> np.ndarray:
-    """Log loss of a classifier of the outcome.
+    """Compute the log loss of a classifier that predicts how trajectories end, such as by toppling.
 
     Args:
-        study: The study.
+        study: Settings of the scenario.
         items: The objects.
         starts: Starts of these objects, with one row for each start.
-        touch: Measurement of touch, `(n, k)`, nan without contact. None: the classifier has vision only.
+        touch: Measurement of touch, such as the logarithm of the mass, `(n, k)`, nan without contact. None: the
+            classifier has vision only.
 
     Returns:
         The loss of each start, `(n,)`, from a classifier that was fitted to other objects.
@@ -166,12 +169,12 @@ def losses(study: Study, items: list[objects.Body], starts: Starts, touch: np.nd
 
 
 def gains(study: Study, items: list[objects.Body], starts: Starts, read: np.ndarray | None) -> None:
-    """Print the log losses of classifiers without and with touch, and the gain from touch.
+    """Print the log losses of classifiers without and with touch, and the gain, the relative decrease of the loss.
 
     Args:
-        study: The study.
+        study: Settings of the scenario.
         items: The objects.
-        starts: Their starts.
+        starts: Starts of these objects, with one row for each start.
         read: Measurement of touch that a network estimated from images, `(n, k)`. None: print no lines for the network.
     """
     exact = study.touch(starts)
@@ -193,12 +196,12 @@ def gains(study: Study, items: list[objects.Body], starts: Starts, read: np.ndar
 
 
 def lesson(study: Study, items: list[objects.Body], starts: Starts, others: int) -> Lesson:
-    """Make the training data of the networks, and the images to which the networks are applied.
+    """Make the training data of the networks that read tactile images, and the images under study.
 
     Args:
-        study: The study.
+        study: Settings of the scenario.
         items: The objects under study.
-        starts: Their starts.
+        starts: Starts of the objects under study, with one row for each start.
         others: Number of training objects.
     """
     rest = bodies(study.categories, others, OTHERS)
@@ -207,10 +210,12 @@ def lesson(study: Study, items: list[objects.Body], starts: Starts, others: int)
 
 
 def pictures(study: Study, learned: Lesson, starts: Starts, steps: int) -> np.ndarray:
-    """Estimate touch from tactile images with a network.
+    """Estimate the measurement of touch from tactile images with a network.
+
+    The measurement is the logarithm of the mass on the jerked pad, and the centre of pressure on the slope.
 
     Args:
-        study: The study.
+        study: Settings of the scenario.
         learned: Training data of the network, and the images under study.
         starts: The starts under study.
         steps: Training steps of the network.
@@ -265,10 +270,11 @@ def detect(name: str, images: np.ndarray, starts: Starts, new: np.ndarray, held_
 
 
 def fill(learned: Lesson, items: list[objects.Body], starts: Starts, num: int, steps: int) -> None:
-    """Print the AUCs of networks that separate fuller from emptier objects.
+    """Print the AUCs of three networks that detect whether an object is more than half full.
 
-    The networks see tactile images of standing objects, visual images of objects in the air, or such images with a tint
-    on the fuller objects. The last case tests that the network detects a fill that is visible.
+    The first network sees tactile images of standing objects. The second network sees visual images of objects in the
+    air. The third network sees the same visual images, but with a tint on all objects that are more than half full.
+    The third case tests that the network detects a fill that is visible.
 
     Args:
         learned: Training data, and the tactile images under study.

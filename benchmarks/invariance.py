@@ -1,4 +1,4 @@
-"""Shares of rest poses and outcomes, compared with those at half the time step, in mirrored scenes, and in C MuJoCo.
+"""Test whether shares of rest poses and outcomes change with half the time step, a mirrored scene, or C MuJoCo.
 
     python -m benchmarks.invariance             # 4,000 runs per side, about 50 minutes on two idle cores
     python -m benchmarks.invariance --num 300   # about 5 minutes
@@ -25,8 +25,8 @@ C MuJoCo keeps at most four contacts of a mesh that stands on a face. A round ba
 
 The command prints the share of each label on our side and on each other side, with the 95 % interval of the difference.
 All sides have the same starts and hidden properties (such as friction), so each run on our side is paired with a run on
-each other side. The interval is the one for the shares of paired runs (Agresti and Min 2005, with half a count added to
-each cell). The command writes no files.
+each other side. The interval is computed for paired proportions (Agresti and Min 2005, with half a count added to each
+cell). The command writes no files.
 """
 
 import concurrent.futures
@@ -73,7 +73,7 @@ class MirroredFreefall(physics.Freefall):
     """The scenario `Freefall` with mirrored starts, for objects from `objects.mirror`."""
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-        """Mirror the start that `Freefall.start` draws for the unmirrored shape."""
+        """Return the mirror image of the start that `Freefall.start` draws for the unmirrored shape."""
         return mirror(super().start(key, mirror_shape(shape), pad))
 
 
@@ -81,7 +81,7 @@ class MirroredPerturbed(physics.Perturbed):
     """The scenario `Perturbed` with mirrored starts and jerks, for objects from `objects.mirror`."""
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-        """Mirror the start that `Perturbed.start` draws for the unmirrored shape."""
+        """Return the mirror image of the start that `Perturbed.start` draws for the unmirrored shape."""
         return mirror(super().start(key, mirror_shape(shape), pad))
 
 
@@ -97,7 +97,7 @@ def mirror_shape(shape: Shape) -> Shape:
 
 
 class Case(NamedTuple):
-    """A scenario, its bodies, and the labels of its final states."""
+    """A scenario, its bodies, and the labels that its final states can have, such as "fell off"."""
 
     name: str
     scenario: physics.Freefall | physics.Perturbed

@@ -77,7 +77,7 @@ def seen(
     Args:
         views: Conversion from raw images of the twin's camera to the view of the simulated pinhole camera.
         predictor: The model.
-        pairs: Pairs of a visual and a tactile image of the twin's camera, `n` of them.
+        pairs: List of `n` pairs. A pair is a visual and a tactile image of the twin's camera.
         index: 0 for the visual stream, 1 for the tactile stream.
         size: Height and width of the result, divisors of the height and width of the model's inputs. Each pixel is the
             mean of a block of pixels. Default: the size of the model's inputs.

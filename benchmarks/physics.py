@@ -119,7 +119,7 @@ def rod() -> objects.Body:
 
 
 def in_c(items: list[objects.Body], traj: physics.Trajectory, constants: physics.Contact) -> tuple[list, np.ndarray]:
-    """Prepare trajectories for C MuJoCo.
+    """Make the models and initial states with which C MuJoCo simulates the same starts as given trajectories.
 
     Args:
         items: The objects.
@@ -127,7 +127,7 @@ def in_c(items: list[objects.Body], traj: physics.Trajectory, constants: physics
         constants: Constants of the contact.
 
     Returns:
-        A `mujoco.MjModel` for each trajectory, and the initial states, `(n, size)`.
+        A `mujoco.MjModel` for each trajectory, and the initial states for `mujoco.rollout`, `(n, size)`.
     """
     gel, models, states = Sensor().gel.size, [], []
     pad = (float(gel[0]), float(gel[1]))
@@ -334,7 +334,7 @@ def pipeline(count: int) -> None:
 
 
 def first_call(name: str, count: int) -> dict[str, Any]:
-    """Measure the first call of `simulate` in this process, which must be a new process.
+    """Measure the compilation time of `simulate` and count its compilations. This process must be a new process.
 
     Args:
         name: Name of the scenario, in SCENARIOS.

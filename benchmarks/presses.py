@@ -19,9 +19,9 @@ lights lie under the part of the gel that the image shows.
 The command prints the peak signal-to-noise ratio of the background alone, of a fit with far lights, and of a fit with
 near lights. Each ratio is computed over the pixels of all held-out presses within 0.92 times the radius of the contact.
 For the fits, the command also prints the ratio over the pixels that were fitted. `presses.png` has a column for each
-held-out press: the real image, our image, and four times their difference on grey. Outside of the contact the shape of
-the skin is unknown, and our image is the background. Candidates, number of steps and learning rate were chosen on the
-36 presses alone.
+held-out press: the real image, the rendered image, and `0.5 + 4 (real - rendered)`. Outside of the contact the shape of
+the skin is unknown, and the rendered image is the background. Candidates, number of steps and learning rate were chosen
+on the 36 presses alone.
 """
 
 import dataclasses
@@ -53,7 +53,10 @@ OUT = Path(__file__).parent / "results" / "presses"
 
 @dataclasses.dataclass(frozen=True)
 class Presses:
-    """Image without contact, images of the presses, and the circle of contact in each. Colours are in [0, 1]."""
+    """Images of a ball that is pressed into the sensor, the circle of contact in each, and the image without contact.
+
+    Colours are in [0, 1].
+    """
 
     background: Float[np.ndarray, "h w 3"]
     images: Float[np.ndarray, "n h w 3"]
@@ -64,7 +67,7 @@ class Presses:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Pixels:
-    """Pixels of several presses, in one list."""
+    """Pixels of several images of the pressed ball, in one list."""
 
     normals: Float[Array, "p 3"]  # unit normals of the skin, towards the camera
     points: Float[Array, "p 3"]  # points of the skin (m), with the origin in the middle of the image
@@ -202,7 +205,7 @@ def changes(constants: tactile.Phong, lights: tactile.Lights | tactile.Leds, giv
 
 @jax.jit
 def draw(constants: tactile.Phong, lights: tactile.Lights | tactile.Leds, given: Pixels) -> Float[Array, "p 3"]:
-    """Render our image of the pressed skin, on the real background."""
+    """Render the image of the pressed skin, `background (1 + phong(pressed) - phong(flat))`."""
     return given.background * (1 + changes(constants, lights, given).T @ lights.colors)
 
 
@@ -253,7 +256,7 @@ def fit(given: Pixels, *, near: bool, steps: int = STEPS) -> tuple[tactile.Phong
 
 
 def panel(presses: Presses, index: int, constants: tactile.Phong, leds: tactile.Leds, *, half: int = 90) -> np.ndarray:
-    """Draw the real image, our image and their difference around a contact, one below the other.
+    """Draw the real image, the rendered image and their difference around a contact, one below the other.
 
     Args:
         presses: The images and contacts.
@@ -263,7 +266,7 @@ def panel(presses: Presses, index: int, constants: tactile.Phong, leds: tactile.
         half: Half the side of the drawn square around the contact (pixels).
 
     Returns:
-        An image in [0, 1], `(6 * half, 2 * half, 3)`. Outside of the contact, our image is the background.
+        An image in [0, 1], `(6 * half, 2 * half, 3)`. Outside of the contact, the rendered image is the background.
     """
     given = pixels(presses, np.array([index]), within=1.0)
     column, row = (int(v) for v in presses.centres[index])

@@ -95,7 +95,7 @@ def train(
 
 
 def best_possible(workdir: Path) -> float | None:
-    """Read the visual skill of the best possible prediction from `metrics.json`, or return None if it is missing."""
+    """Read the visual skill of the best possible prediction from `metrics.json`. None: the file or value is missing."""
     path = workdir / "metrics.json"
     if not path.exists():
         return None

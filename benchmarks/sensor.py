@@ -375,7 +375,7 @@ def cost_of(faces: int, height: int, width: int) -> dict[str, float]:
 
 
 def cost() -> None:
-    """Print the time and the memory of a frame for several numbers of pixels and of faces, and plot the time.
+    """Print the time and the peak memory to render a frame with several numbers of pixels and faces, and plot the time.
 
     Each combination is measured in a new process.
     """
@@ -428,7 +428,7 @@ def compilations(number: int = 100) -> None:
 
 
 def main(args: Args) -> None:
-    """Run the chosen measurement."""
+    """Run the measurement of the option `--taxim`, `--cost` or `--compile`, or else measure the speed of `sense`."""
     if args.taxim:
         compare_taxim()
     elif args.cost:

@@ -65,7 +65,7 @@ class Args:
 
 
 def collection(args: Args) -> dataset.Collection:
-    """Describe a dataset of the experiment `args.model` with new objects, which no model was trained on.
+    """Make the settings of a dataset of the experiment `args.model`, with objects that no model was trained on.
 
     The training split contains a fifth of the objects, which only define the baselines and the frequencies of the
     outcomes. The test split contains the other objects. The validation split is empty.
@@ -159,7 +159,8 @@ def _predictor(args: Args, scenario: physics.Scenario) -> sts.Predictor:
         raise ValueError(
             f"the model in --trained {args.trained} has {config.outcomes} outcomes and a condition vector of length "
             f"{config.condition}, but the experiment {args.model} has {outcomes} outcomes and a condition vector of "
-            f"length {known}: give a model that this experiment trained"
+            f"length {known} (the known quantities of a trajectory, such as the acceleration of the pad): give a model "
+            "that this experiment trained"
         )
     return predictor
 

@@ -6,10 +6,10 @@
     python -m benchmarks.soak --first-block 17           # skip blocks 0 to 16, if another machine runs these blocks
 
 A new object is made for every eight trajectories. Objects of all classes are made in turn, except in the scenario
-`perturbed` (the jerked pad), where all objects are bottles. The command counts the outcomes and the unsettled
-trajectories. A trajectory is unsettled if the object is neither at rest nor off the pad at the end. The command also
-counts the trajectories that `simulate` discarded and drew again, because they were not finite or because the object
-sank deeper into the pad than `physics.simulation.SUNK_LIMIT`.
+`perturbed` (the jerked pad), where all objects are bottles. The command counts the outcomes, such as falling off, and
+the unsettled trajectories. A trajectory is unsettled if the object is neither at rest nor off the pad at the end. The
+command also counts the trajectories that `simulate` discarded and replaced by new ones, because they were not finite or
+because the object sank deeper into the pad than `physics.simulation.SUNK_LIMIT`.
 
 The command compares the wrench at rest with the weight. For the frames without contact, it compares the energy of the
 object with the energy at the start. All results are printed.
@@ -99,9 +99,10 @@ def block(name: str, index: int, size: int) -> dict[str, np.ndarray]:
         size: Number of trajectories, a multiple of NUM.
 
     Returns:
-        Arrays by name, with a row for each trajectory. `wrench_error` is the error of the force at rest, as a share of
-        the weight, or nan if the object does not rest on the pad alone. `excess` is the largest `excess_energy` in
-        frames without contact. It is -inf if the object fell off or always had contact, and nan if gravity changes.
+        Arrays by name, with a row for each trajectory. `wrench_error` is the length of (force of the pad at rest +
+        weight vector), divided by the weight. It is nan for trajectories whose object does not rest on the pad or
+        touches the wall. `excess` is the largest `excess_energy` in frames without contact. It is -inf for trajectories
+        whose object fell off or had contact in every frame. It is nan for scenarios in which gravity changes.
     """
     scenario = SCENARIOS[name]
     first = index * size // NUM
@@ -147,16 +148,15 @@ def claim(folder: Path, name: str, size: int) -> None:
 
 
 def soaked(folder: Path, name: str) -> Starts:
-    """Load the starts and outcomes of the kept blocks of a scenario.
+    """Load the initial states and outcomes of a scenario's trajectories, which a run with `--keep` stored.
 
     Args:
         folder: Folder of a run with `--keep`.
         name: Name of the scenario, in SCENARIOS.
 
     Returns:
-        The starts and outcomes. In other benchmarks, the field `rerolled` is the outcome of a second simulation from
-        the same start with other contents of the object. Here, all values of `rerolled` are -1, because this benchmark
-        simulates each start only once.
+        The initial states and outcomes, with one row for each trajectory. All values of the field `rerolled` are -1.
+        This field is for benchmarks that simulate each initial state a second time.
 
     Raises:
         FileNotFoundError: The folder has no blocks.

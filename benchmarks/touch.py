@@ -6,7 +6,7 @@
 A ridge regression of the logarithm of the mass on simple features of the image is fitted to the training objects. The
 features are the summed darkness of the imprint, its largest darkness and its number of pixels. The command uses the
 last images of objects that rest on the pad. It prints the accuracy on held-out objects, and the share of imprint pixels
-that are saturated, at 0 or 255. It writes no files.
+that are saturated (value 0 or 255 in a channel). It writes no files.
 """
 
 import dataclasses
@@ -27,18 +27,23 @@ class Args:
 
 
 def features(tactile: np.ndarray, blank: np.ndarray) -> np.ndarray:
-    """Compute features of the imprint in each image: its summed and largest darkness, and its number of pixels.
+    """Compute 11 features of the imprint in each image, from the darkness and the number of its pixels.
 
-    The darkness of a pixel is -log(value / value in `blank`), either its largest or its mean value over the channels.
-    The features are the largest darknesses, the logarithms of the sums of the darkness and of the number of pixels, the
-    squares of these logarithms, and the product of two of them.
+    The darkness of a pixel in a channel is -log(value / value in `blank`). For each pixel, `most` is its largest
+    darkness in a channel, but at least 0, and `mean` is the mean of its darkness over the channels. The features are:
+
+    - the logarithms of four quantities of the imprint: the sum of `most`, the sum of `mean`, the sum of the positive
+      values of `mean`, and the number of pixels
+    - the squares of these four logarithms
+    - log(sum of `most`) * log(number of pixels)
+    - the largest `most` and the largest `mean` of the image
 
     Args:
         tactile: Tactile images, uint8 `(n, h, w, 3)`.
         blank: Tactile image of the untouched sensor, uint8 `(h, w, 3)`.
 
     Returns:
-        Features, `(n, k)`.
+        Features, `(n, 11)`.
     """
     ratio = np.clip(tactile.astype(np.float64), 1, 255) / blank.astype(np.float64)
     darkness = np.clip(-np.log(ratio).min(-1), 0, None)

@@ -1,12 +1,12 @@
-"""Frame rates of the digital twin at 640x480 and at 1640x1232.
+"""Frame rates of the digital twin (a simulated camera and LED controller) at 640x480 and at 1640x1232.
 
     python -m benchmarks.twin
 
-For each size, the command prints the time to render a pose, the time to make a noisy frame with the light on for half
-of the exposure, and the time to encode this frame as JPEG. The command also prints two frame rates, which are measured
-with the light off. The first is the number of frames that the twin makes per second if it does not wait between frames.
-The second is the rate at which a second process receives frames through OpenCV. All values are medians, and all
-processes run on one CPU core.
+For each size, the command prints the time to render one pose of an object, the time to make a noisy frame with the
+light on for half of the exposure, and the time to encode this frame as JPEG. The command also prints two frame rates,
+which are measured with the light off. The first is the number of frames that the twin makes per second if it does not
+wait between frames. The second is the rate at which a second process receives frames through OpenCV. All values are
+medians, and all processes run on one CPU core.
 """
 
 import dataclasses
@@ -61,7 +61,7 @@ def timed(call: Callable[[], object], number: int) -> float:
 
 
 def held(size: tuple[int, int], exposure_s: float) -> tuple[twin.Twin, twin.ObjectScene]:
-    """Make a digital twin and its scene, with one object of the class "camera".
+    """Make a digital twin of the sensor, and its scene with one object of the object class "camera".
 
     The lens of the twin has a field of view of 160 degrees. The pad is empty until the twin receives the command
     `hold`, which places the object on the pad.
@@ -78,7 +78,9 @@ def held(size: tuple[int, int], exposure_s: float) -> tuple[twin.Twin, twin.Obje
 
 
 def served(size: tuple[int, int], number: int) -> float:
-    """Rate at which a second process receives frames over HTTP (frames/s), the median over windows of `WINDOW` frames.
+    """Rate at which a second process receives frames of the digital twin over HTTP (frames/s).
+
+    The rate is the median over windows of `WINDOW` frames.
 
     Args:
         size: Height and width of the frames (pixels).

@@ -178,7 +178,7 @@ def expose(config: Config, camera: hardware.Camera, leds: hardware.Leds) -> tupl
 
 
 def ideal(config: Config, pinhole: hardware.Pinhole) -> hardware.Lens:
-    """Make the lens of `--ideal-lens`, which is assumed to be without error.
+    """Make a lens without error that has the field of view of the option `--ideal-lens`.
 
     Raises:
         CalibrationError: The raw image of this lens does not contain the whole view of the sensor. The view is the part
@@ -271,7 +271,7 @@ def claim_pictures(config: Config, camera: hardware.Camera) -> None:
 
 
 def main(config: Config) -> None:
-    """Run all steps and write the sensor file."""
+    """Commission the sensor, or only write the calibration board or list the devices, as the options require."""
     if config.print_board is not None:
         hardware.save_board(config.print_board)
         print(f"{config.print_board}: print it at 100 % on A4. The ruler on the page must measure 100 mm")

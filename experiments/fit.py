@@ -100,10 +100,11 @@ def moved(pose: jax.Array, at: jax.Array) -> jax.Array:
 
 
 def carried(wrench: jax.Array, pose: jax.Array, at: jax.Array) -> jax.Array:
-    """Compute the new wrench of a vertical force that moves with the object.
+    """Compute the wrench of the pad on the object after a move, for a vertical force that moves with the object.
 
     Args:
-        wrench: Force (N) and moment about the sensor's origin (N m) of the pad on the object in `pose`, shape (6,).
+        wrench: Force (N) and moment about the sensor's origin (N m) that the pad exerts on the object before the move,
+            shape (6,).
         pose: Pose of the object before the move, shape (7,).
         at: Shift in x and y (m) and turn (rad) of the object, as in `moved`, shape (3,).
 
@@ -139,7 +140,8 @@ def slope(
         sensor: Constants of the sensor.
         body: The object.
         pose: Pose of the object before the move, shape (7,).
-        wrench: Force (N) and moment about the sensor's origin (N m) of the pad on the object in `pose`, shape (6,).
+        wrench: Force (N) and moment about the sensor's origin (N m) that the pad exerts on the object before the move,
+            shape (6,).
         at: Shift in x and y (m) and turn (rad), shape (3,).
         target: Image to which the pose is fitted, shape (height, width, 3).
         blur: Standard deviation of the Gaussian blur (m).

@@ -4,8 +4,10 @@
         --simulated runs/twin/dataset --simulated-sensor runs/twin
     python -m experiments.gap --real runs/real/dataset --sensor bench --simulated runs/released/dataset --match none
 
-`--real` and `--simulated` are sessions of `experiments.real collect`. The simulated images may also be the dataset of
-an experiment that was run with `--collection.no-crop`. Raw images are rectified with the lens of the sensor file.
+`--real` and `--simulated` are folders of trajectories that `experiments.real collect` recorded. `--simulated` may also
+be the dataset of an experiment that was run with `--collection.no-crop`. Raw images are rectified with the lens of the
+sensor file. By default, trajectories of the same number must show the same object in the same poses. With
+`--match none`, the two folders show the same object in different poses.
 
 The command prints differences per pixel, the distance between the distributions of real and simulated images in a
 feature space, and the accuracy of a classifier that tries to distinguish real from simulated images. The command
@@ -32,7 +34,7 @@ STREAMS = ("visual", "tactile")
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """The real and the simulated images, and how they are compared."""
+    """Options of the command line: the folders of real and simulated images, and how the images are compared."""
 
     real: Folder  # folder of the real images: a session of `experiments.real collect`
     simulated: Folder  # folder of the simulated images: a session, or the dataset of an experiment
@@ -53,9 +55,10 @@ class Config:
 
 @dataclasses.dataclass(frozen=True)
 class Side:
-    """The real or the simulated images.
+    """Either the real images or the simulated images, with a description of their source.
 
-    Each trajectory has two successive images in each stream: first the initial image, then the final image.
+    The visual images and the tactile images have the same order: the initial and the final image of the first
+    trajectory, then those of the second trajectory, and so on.
     """
 
     images: gap.Streams  # images of both streams, with the number of their trajectory
@@ -68,18 +71,17 @@ class Side:
 
 
 def session(folder: Path, sensor: Path | None, resolution: tuple[int, int]) -> Side:
-    """Read the images of a session, and rectify them with the lens of a sensor file.
+    """Read the images that `experiments.real collect` recorded, and rectify them with the lens of a sensor file.
 
     Args:
-        folder: Folder of the session.
+        folder: Folder of the recorded trajectories.
         sensor: Path of the sensor file. None: the images are rectified already.
         resolution: (height, width) of the result (pixels).
 
     Raises:
-        FileNotFoundError: There is no session or no sensor file.
+        FileNotFoundError: There are no recorded trajectories or no sensor file.
         SensorFileError: The sensor file is damaged or describes no device.
-        ValueError: The user has confirmed no trajectory of the session, or the lens was calibrated with images of
-            another size.
+        ValueError: The user has confirmed no trajectory, or the lens was calibrated with images of another size.
     """
     recordings = hardware.load_recordings(folder)
     size = f"{resolution[0]} x {resolution[1]}"
@@ -111,7 +113,7 @@ def simulated_dataset(folder: Path, resolution: tuple[int, int] | None) -> Side:
 
     Args:
         folder: Folder of the dataset.
-        resolution: (height, width) of the images (pixels), or None for any.
+        resolution: (height, width) that the images must have (pixels). None: any size is accepted.
 
     Raises:
         ValueError: The images have another size than `resolution`, or are cropped to the object.
@@ -132,7 +134,7 @@ def simulated_dataset(folder: Path, resolution: tuple[int, int] | None) -> Side:
 
 
 def side(visual: np.ndarray, tactile: np.ndarray, numbers: np.ndarray, described: str) -> Side:
-    """Make a `Side`.
+    """Make a `Side` from the images of n trajectories.
 
     Args:
         visual: Initial and final visual images, shape (n, 2, height, width, 3).
@@ -158,7 +160,7 @@ def centred(image: np.ndarray, resolution: tuple[int, int]) -> np.ndarray:
 
 
 def load(config: Config) -> tuple[Side, Side]:
-    """Read the images that are compared.
+    """Read the real images and the simulated images.
 
     Returns:
         The real and the simulated images. With `--match number`, the real and the simulated images have the same
@@ -172,8 +174,8 @@ def load(config: Config) -> tuple[Side, Side]:
     is_dataset = (config.simulated / "collection.json").exists()
     if is_dataset and config.match == "number":
         raise ValueError(
-            f"{config.simulated} is a dataset, whose trajectory numbers do not correspond to those of a session: give "
-            "--match none"
+            f"{config.simulated} is a dataset, whose trajectory numbers do not correspond to the trajectory numbers of "
+            "the real images: give --match none"
         )
     if is_dataset and config.simulated_sensor is not None:
         raise ValueError(
@@ -216,7 +218,11 @@ def report(real: Side, simulated: Side, *, matched: bool) -> str:
 
 
 def measured(real: gap.Streams, simulated: gap.Streams, stream: str, *, matched: bool) -> dict[str, str]:
-    """Compare the real and the simulated images of one stream. Return formatted values by the names of the metrics."""
+    """Compare the real with the simulated images of one stream, "visual" or "tactile".
+
+    Returns:
+        Formatted values by the names of the metrics.
+    """
     first, second = getattr(real, stream), getattr(simulated, stream)
     rows = {}
     if matched:

@@ -41,7 +41,7 @@ PRINT_S = 1.0  # time between two lines in the terminal (s)
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """The source of the images, the model, and the outputs."""
+    """Options of the command line: the source of the images, the model, and the outputs."""
 
     sensor: Path | None = None  # sensor file of experiments.commission, or its folder
     camera: str | None = None  # path or URL of the camera. None: the camera of the sensor file
@@ -75,7 +75,7 @@ class Config:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Source:
-    """The source of the live images. The function that makes it does not connect the sensor."""
+    """The source of the live images: a sensor, a digital twin or a recording. `follow` connects it."""
 
     name: str  # description for the title of the page
     sensor: hardware.STS | hardware.Replay  # device or recording
@@ -108,7 +108,7 @@ def check(config: Config) -> None:
         )
     if config.sensor is None and (config.camera is None) != (config.leds is None):
         missing = "--camera" if config.camera is None else "--leds"
-        raise ValueError(f"{missing} is missing: both --camera and --leds are needed, or a sensor file with --sensor")
+        raise ValueError(f"{missing} is missing: give both --camera and --leds, or a sensor file with --sensor")
     if config.sensor is not None and not hardware.sensor_file.sensor_file(config.sensor).exists():
         raise ValueError(
             f"--sensor is {config.sensor}, but there is no sensor file: give another path, or write the file with "
@@ -237,7 +237,11 @@ class Screen:
             self._page.show(seen)
 
     def seen(self) -> Seen | None:
-        """The newest images and prediction, or None before both streams have an image."""
+        """Return the newest images and the newest prediction.
+
+        Returns:
+            The images and the prediction. While a stream has no image yet, None.
+        """
         shown, live, arrived_s = self._shown, self.live, list(self._arrived_s)
         if len(shown) < 2 or live is None:
             return None

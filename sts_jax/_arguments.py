@@ -95,7 +95,7 @@ def checked_masks(
             )
         if mask.dtype != bool:
             raise ValueError(
-                f"present[{name!r}] is {mask.dtype}, but it must be bool: True for the items that are used."
+                f"present[{name!r}] has dtype {mask.dtype}, but it must be bool: give True for the items to use."
             )
         masks[name] = mask
     return masks
@@ -119,16 +119,16 @@ def checked_measurements(measurements: Any, reserved: tuple[str, ...]) -> dict[s
     own = {name: value for name, value in (measurements or {}).items() if value is not None}
     for name in reserved:
         if name in own:
-            raise ValueError(f"measurements has the name {name!r}: pass the argument {name} instead.")
+            raise ValueError(f"measurements must not have the key {name!r}: pass these values as the argument {name}.")
     return own
 
 
 def checked_samples(num_samples: Any, key: Any) -> int:
-    """Check the number of samples and the random key that draws them, and return the number.
+    """Check the arguments `num_samples` and `key` of a `Predictor`, and return `num_samples` as an int.
 
     Args:
-        num_samples: Number of samples, >= 0.
-        key: One key of `jax.random.key`. It may be None if `num_samples` is 0.
+        num_samples: Number of samples to draw, >= 0.
+        key: Random key that draws the samples, one key of `jax.random.key`. It may be None if `num_samples` is 0.
 
     Raises:
         ValueError: `num_samples` is negative, traced or not a whole number, or `key` is missing or not a single key.
@@ -163,8 +163,8 @@ def plausible(kind: Kind, array: Float[Array, "..."]) -> Bool[Array, "*n"]:
 
     Args:
         kind: Kind of the input.
-        array: Images (*n, height, width, channels), poses (*n, 7): position (m) and unit quaternion, or vectors
-            (*n, size). There may be any number of leading axes *n.
+        array: Images of shape (*n, height, width, channels), poses of shape (*n, 7), or vectors of shape (*n, size),
+            with any leading axes *n. A pose is a position (m) and a unit quaternion.
 
     Returns:
         Mask of the items in range.
@@ -183,8 +183,8 @@ def check_values(name: str, kind: Kind, array: np.ndarray) -> None:
     Args:
         name: Name of the modality, for error messages.
         kind: Kind of the input.
-        array: Images (..., height, width, channels), poses (..., 7): position (m) and unit quaternion, or vectors
-            (..., size).
+        array: Images of shape (..., height, width, channels), poses of shape (..., 7), or vectors of shape
+            (..., size). A pose is a position (m) and a unit quaternion.
 
     Raises:
         ValueError: A number is NaN or infinite, an image has values outside [0, 1], a quaternion's length is not 1

@@ -5,9 +5,9 @@ The column and the row are whole numbers at the centre of a pixel.
 There is one function for each pattern of access: `bilinear` for any points of one image, `bilinear_batch` for many
 points in each of several small images with channels, and `shifted` for the same offset from every pixel.
 
-In `bilinear` and `bilinear_batch`, a point outside the image gets the value of the nearest point inside, unless the
-image repeats. To get zero outside the image, pad the image with a ring of zeros. For `shifted`, the caller adds a wide
-border to the image, and a point outside the image gets a value of this border.
+In `bilinear` and `bilinear_batch`, a point outside the image gets the value of the nearest point inside. To get zero
+there, pad the image with a ring of zeros. With `bilinear(..., wrap=True)`, the image repeats beyond its border. For
+`shifted`, the caller adds a wide border to the image, and a point outside the image gets a value of this border.
 """
 
 import jax

@@ -313,7 +313,7 @@ class Predictor:
 
     @property
     def empty(self) -> dict[str, np.ndarray]:
-        """Images of the untouched sensor under "visual" and "tactile": float32 (height, width, 3) in [0, 1]."""
+        """Images of the untouched sensor with the keys "visual" and "tactile": float32 (height, width, 3) in [0, 1]."""
         return {name: np.asarray(image) for name, image in self._empty.items()}
 
     def _checked_name(self, name: str, value: Any) -> np.ndarray | Array:

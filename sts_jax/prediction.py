@@ -149,8 +149,8 @@ def predict_samples(
         preprocessing: Preprocessing with which the model was trained.
         empty: Images "visual" and "tactile" of the untouched sensor in [0, 1].
         inputs: All inputs of the model by the name of the modality: images (*n, height, width, 3) and poses (*n, 7).
-            For inputs that are not given, call `completed` first, which adds placeholders. The entry "state", the true
-            state (*n, code) from `statespace.encode`, is optional.
+            For inputs that are not given, call `completed` first, which adds placeholders. The entry "state" is
+            optional. It contains codes (*n, code) of the true pose, shape and mass, from `statespace.encode`.
         present: Masks (*n,) by the name of the modality. False means that the input of this modality is ignored for
             this item of the batch.
         condition: Known parameters of each trajectory in SI units, (*n, c). None for a model that was trained without
@@ -266,7 +266,8 @@ def flagged(prediction: Prediction, valid: Bool[Array, "*n"], *, leading: int = 
     Args:
         prediction: Prediction, or the samples of a prediction.
         valid: Mask that is False for the invalid items.
-        leading: Number of axes of the images, poses and measurements before the axes `*n`: 1 for samples, else 0.
+        leading: Number of axes that images, poses and measurements have before the axes of `valid`. It is 1 for samples
+            and 0 for all other predictions.
 
     Returns:
         The prediction with NaN in the invalid items.

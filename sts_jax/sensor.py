@@ -306,8 +306,8 @@ def _row_conditions(name: str, fields: dict[str, Any]) -> Iterator[_Condition]:
     rows, colors = _array(fields[place]), _array(fields["colors"])
     if len(rows) != len(colors):
         raise ValueError(
-            f"fields {name}.{place} and {name}.colors have {len(rows)} and {len(colors)} rows, but every light needs "
-            "one row in both."
+            f"field {name}.{place} has {len(rows)} rows and field {name}.colors has {len(colors)} rows, but both must "
+            "have one row for each light: give them the same number of rows."
         )
     if place == "directions":
         yield (

@@ -173,7 +173,7 @@ def test_bad_input_is_refused_with_its_name():
     with pytest.raises(ValueError, match="at least 64 pixels"):
         gap.features(frames[:, :32])
     described = gap.features(frames)
-    with pytest.raises(ValueError, match="number of common trajectories is 2"):
+    with pytest.raises(ValueError, match="Number of common trajectories: 2"):
         gap.energy_distance(described, described, group, group + 4)
     with pytest.raises(ValueError, match="at least 5 trajectories, got 3"):
         gap.told_apart(described[:6], described, group[:6], group + 6)

@@ -235,7 +235,7 @@ def test_files_of_panels(tmp_path, monkeypatch):
         ({"twin": True, "sensor": "a"}, "--twin and --sensor exclude each other"),
         ({"sensor": "none"}, "--sensor is none, but there is no sensor file: give another path, or write"),
         ({"replay": ("a", "b", "c")}, "--replay has 3 paths, but it takes one folder, or a visual and a tactile video"),
-        ({"camera": "http://127.0.0.1/"}, "both --camera and --leds are needed"),
+        ({"camera": "http://127.0.0.1/"}, "--leds is missing: give both --camera and --leds"),
         ({"seconds": 0.0}, "seconds must be > 0, got 0"),
         ({"dwell": 0}, "dwell must be >= 1, got 0"),
         ({"replay": ("a",), "record": "b"}, "--record and --replay exclude each other"),

@@ -91,11 +91,13 @@ def test_an_experiment_trains_and_scores_a_further_modality(tmp_path):
     assert summary["MVAE with pose, from force"]["force_error"]["value"] > 0
     assert summary["VAE visual only, from visual"]["force_error"] is None
     assert "force error (N)" in (tmp_path / "table-full.md").read_text()
+    with pytest.raises(ValueError, match=r"measurements has .*mvae was trained with \['force'\]"):
+        stages.main(config, tmp_path, only="evaluate")
 
 
 def test_a_further_modality_of_a_state_space_model_is_refused_before_anything_is_collected(tmp_path):
     force = dataset.Measurement("force", (3,), lambda data, rows: None)
-    with pytest.raises(ValueError, match="'force', but only the paper's model with all modalities accepts"):
+    with pytest.raises(ValueError, match="measurements must be empty for model='statespace', got the modality 'force'"):
         stages.main(freefall.SMOKE, tmp_path / "run", own=Extensions(measurements=(force,)))
     assert not (tmp_path / "run").exists()
 

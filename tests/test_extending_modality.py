@@ -201,7 +201,7 @@ def test_an_invalid_traced_measurement_gives_nan_in_its_item_alone(predictor):
         ({"load": np.full(1, np.nan, np.float32)}, "load has NaN or infinite values"),
         ({"load": np.zeros(1, np.int32)}, r"load is int32, but it must be floating-point\.$"),
         ({"sound": np.zeros(1, np.float32)}, "does not accept sound: the model was trained on load"),
-        ({"pose": np.zeros(7, np.float32)}, "measurements has the name 'pose': pass the argument pose"),
+        ({"pose": np.zeros(7, np.float32)}, "measurements must not have the key 'pose': pass these values as"),
         ([1.0], "measurements is a list, but it must be a dict"),
         ({}, "nothing to predict from: give at least one of load"),
     ],
@@ -285,7 +285,7 @@ def test_measurements_are_scored_against_the_truth_and_the_baselines(predictor):
     own = np.asarray(predictor(measurements={"load": first[:, None]}).measurements["load"])[1:, 0]
     assert found["model"] == pytest.approx(np.abs(truth - own).mean(), rel=1e-4)
     assert metric.title == "load error (N)"
-    with pytest.raises(ValueError, match="`test` lacks load: pass measurements"):
+    with pytest.raises(ValueError, match="lacks 'load': pass measurements"):
         evaluation.predict(predictor, ("load",), test._replace(measurements={}), scenario)
 
 

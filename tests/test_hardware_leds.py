@@ -185,7 +185,7 @@ def test_messages_that_do_not_fit_a_line_are_not_sent():
         protocol.encode("x" * 60)
     with pytest.raises(protocol.ProtocolError, match="printable ASCII"):
         protocol.encode("1 PING*")
-    with pytest.raises(protocol.ProtocolError, match="arguments are missing"):
+    with pytest.raises(protocol.ProtocolError, match="wrong number of arguments"):
         protocol.encode_request(protocol.Set(1, (0, 0, 0, 300)))
 
 

@@ -253,7 +253,7 @@ def test_parts_of_the_view_that_the_camera_does_not_see_are_black():
         ({"k": (0.0, 0.0)}, "k must be a tuple of 4 finite ints or floats"),
         ({"k": (0.0, math.inf, 0.0, 0.0)}, "k must be a tuple of 4 finite ints or floats"),
         ({"rotation": (0.0, 0.0)}, "rotation must be a tuple of 3 finite ints or floats"),
-        ({"translation": (0.0, 0.0, -0.1)}, "the third number of translation must be > 0"),
+        ({"translation": (0.0, 0.0, -0.1)}, r"translation\[2\] must be > 0 m"),
         ({"rotation": (math.pi, 0.0, 0.0)}, r"place the camera at .* must lie inside the sensor, where z is negative"),
     ],
 )

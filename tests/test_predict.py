@@ -365,7 +365,7 @@ POSE = measurement()["pose"]
         ({"pose": POSE, "key": jax.random.key(0), "num_samples": "2"}, "num_samples='2'"),
         ({"pose": POSE, "key": jax.random.key(0), "num_samples": -1}, "num_samples=-1"),
         ({"pose": POSE, "present": [True]}, "present is a list"),
-        ({"pose": POSE, "present": {"pose": 1.0}}, r"present\['pose'\] is float64, but it must be bool"),
+        ({"pose": POSE, "present": {"pose": 1.0}}, r"present\['pose'\] has dtype float64, but it must"),
         ({"pose": POSE, "present": {"pose": "yes"}}, r"present\['pose'\] is 'yes'"),
         ({"pose": POSE, "present": {"sound": True}}, r"present\['sound'\].*must be among \['pose'\]"),
         ({"pose": POSE, "condition": "fast"}, "condition is 'fast'"),

@@ -484,7 +484,7 @@ def test_rigid_finds_the_nearest_rotation():
         ({"window": 12}, "window is 12 pixels, but it must be a positive multiple of 8"),
         ({"input_size": 24}, "input_size is 24 pixels, but it must be a positive multiple of 16, the image_size"),
         ({"encoder": (4, 4)}, "encoder has 2 widths and decoder has 3, but each must have 3"),
-        ({"condition": 1}, r"condition is 1 and vectors is 1, but condition .* must be 0, or at least 2 \* vectors"),
+        ({"condition": 1}, r"condition is 1 and vectors is 1, but they must satisfy condition >= 2 \* vectors >= 0"),
         ({"drawn_first": 0.0}, r"drawn_first is 0\.0"),
         ({"outcome_names": ("rests",)}, r"outcome_names has 1 names \('rests',\), but outcomes is"),
     ],

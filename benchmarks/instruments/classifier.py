@@ -65,7 +65,7 @@ def mean(values: np.ndarray, weight: np.ndarray) -> float:
 
 
 def gain(before: np.ndarray, after: np.ndarray, weight: np.ndarray) -> float:
-    """Relative decrease of the weighted mean loss from `before` to `after`, each `(n,)`."""
+    """Relative decrease of the weighted mean loss, `1 - mean(after) / mean(before)`, from losses `(n,)` each."""
     return 1 - mean(after, weight) / mean(before, weight)
 
 
@@ -78,7 +78,7 @@ def kept(before: np.ndarray, after: np.ndarray, other: np.ndarray, weight: np.nd
 
 
 def interval(statistic: Callable[..., float], *columns: np.ndarray, groups: np.ndarray) -> Interval:
-    """Compute a statistic and its 95 % bootstrap interval over groups.
+    """Compute a statistic and its 95 % interval, from a bootstrap that resamples groups of rows.
 
     Args:
         statistic: A function of the columns and of the weights of the rows, `(n,)`, such as `mean`.

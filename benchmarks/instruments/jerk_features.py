@@ -18,7 +18,7 @@ NOISE = 0.05  # standard deviation of the measured log mass, about 5 % of the ma
 
 
 class Sight(NamedTuple):
-    """Properties that the visible shape determines, with one row for each object."""
+    """Properties that follow from the visible shape, such as the mass at each fill level. One row for each object."""
 
     profile: np.ndarray  # (b, 10) m: radius of the base, height, greatest radius, radii at seven heights
     low: np.ndarray  # (b,) m, height of the lowest point in the mesh frame

@@ -14,5 +14,5 @@ def public_meshes() -> Path:
     """
     found = importlib.util.find_spec("miniworld")
     if found is None or found.origin is None:
-        raise ModuleNotFoundError("the meshes are part of the package miniworld. Install it: pip install -e '.[test]'")
+        raise ModuleNotFoundError("the meshes need the package miniworld, which is missing: pip install -e '.[test]'")
     return Path(found.origin).parent / "meshes"

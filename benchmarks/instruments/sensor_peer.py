@@ -58,7 +58,10 @@ class Lights:
         return found, mean
 
     def off_after(self, time_s: float) -> float | None:
-        """Return the time (s) since which the lights are off, but at least `time_s`. Return None if they are on now."""
+        """Return the time at which the lights went off, or `time_s` if they went off earlier. None: they are on now.
+
+        Both times are in seconds on `time.monotonic`.
+        """
         with self._lock:
             since_s, share = self._changes[-1]
         return max(since_s, time_s) if share == 0 else None
@@ -189,7 +192,7 @@ class SensorPeer:
         self.lights.changed(protocol.DARK)
 
     def judged(self, image: Image, *, lit: bool) -> bool:
-        """Return whether the lights were at full power (`lit=True`) or off (`lit=False`) for the whole exposure.
+        """Return whether the lights were at full power (`lit=True`) or off (`lit=False`) for an image's whole exposure.
 
         Return False for images that the camera did not take.
         """
@@ -202,7 +205,7 @@ class SensorPeer:
         self.leds.vanish()
 
     def shown(self) -> dict[int, Shown]:
-        """Return the `Shown` of each frame, in a dictionary whose keys are the numbers (`key`) of the frames."""
+        """Return the light of each frame from the log: a dictionary from the frame's number (`key`) to its `Shown`."""
         return {number: Shown(number, exposure.mean) for number, exposure in self.camera.log.items()}
 
 

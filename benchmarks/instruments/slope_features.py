@@ -51,9 +51,10 @@ def margins(corners: np.ndarray, place: np.ndarray) -> list[float]:
         place: The point (m), `(2,)`.
 
     Returns:
-        Four numbers. The first is the distance from the nearest edge (m). The others are the distance (m), the length
-        (m) and the y component of the outward unit normal of the nearest edge that faces downhill (+y), or of the
-        nearest edge if none faces downhill. Distances are positive inside of the polygon and negative outside.
+        Four numbers. The first is the distance from the nearest edge (m). The other three describe the nearest edge
+        that faces downhill (+y), or the nearest edge if none faces downhill. They are the distance from this edge (m),
+        its length (m), and the y component of its outward unit normal. Distances are positive inside of the polygon and
+        negative outside.
     """
     along = np.roll(corners, -1, 0) - corners
     length = np.linalg.norm(along, axis=1) + 1e-9

@@ -1,4 +1,4 @@
-"""Numbered objects, the starts and outcomes of the objects' trajectories, and images of the starts."""
+"""Functions that make objects, simulate their trajectories, and render the first frames of the trajectories."""
 
 import concurrent.futures
 import os
@@ -21,7 +21,10 @@ _settled = jax.jit(jax.vmap(objects.rigid, in_axes=(None, 0, 0)))  # the same fo
 
 
 class Starts(NamedTuple):
-    """Starts and outcomes of trajectories, with one row for each trajectory."""
+    """Starts and outcomes of trajectories, with one row for each trajectory.
+
+    A start is the initial state of a trajectory. The outcome is how the trajectory ends, such as by toppling.
+    """
 
     body: np.ndarray  # (n,) index of the object
     pose: np.ndarray  # (n, 7) pose in the first frame
@@ -152,7 +155,7 @@ def draw(items: list[objects.Body], starts: Starts) -> tuple[np.ndarray, np.ndar
 
 
 def kept(folder: Path | None, name: str, make: Callable[[], Starts]) -> Starts:
-    """Load starts from a file, or make them and write the file.
+    """Load starts from a file. If the file does not exist, make the starts and write the file.
 
     Args:
         folder: Folder of the file. None: make the starts and write nothing.

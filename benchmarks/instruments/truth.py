@@ -75,7 +75,7 @@ def neighbours(image: np.ndarray, beyond: float | None = None) -> np.ndarray:
         beyond: Value outside of the image. None: the image repeats its edge.
 
     Returns:
-        `(9, h, w)`.
+        The nine values of each neighbourhood, row by row, `(9, h, w)`.
     """
     height, width = image.shape
     fill = {"mode": "edge"} if beyond is None else {"constant_values": beyond}

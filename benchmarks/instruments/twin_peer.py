@@ -62,12 +62,12 @@ class TwinPeer:
         self.twin.command("release" if self.twin.state.phase == twin.Phase.HELD else "hold")
 
     def stop(self) -> None:
-        """End all threads."""
+        """Stop the twin, its camera and its LED controller."""
         self._served.close()
         self.twin.close()
 
     def shown(self) -> dict[int, Shown]:
-        """Return the `Shown` of each frame, in a dictionary whose keys are the checksums (`key`) of the frames."""
+        """Return the light of each frame from the log: a dictionary from the image's checksum to its `Shown`."""
         _, *parts = self._record.read_bytes().split(_START)
         frames = zip(parts, twin.read_log(self._log), strict=True)
         return {key(photometry.decode(_START + part)): Shown(frame.index, frame.light) for part, frame in frames}

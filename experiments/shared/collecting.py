@@ -1,4 +1,4 @@
-"""`collect` of `experiments.real`: guide a person through trajectories, and save them in a work directory."""
+"""The sub-command `collect` of `experiments.real`: guide a person through trajectories, and save the trajectories."""
 
 import contextlib
 import dataclasses
@@ -16,7 +16,11 @@ from sts_jax.hardware import AutomaticPerson, EmptyPad, GuideConfig, Person, Vie
 
 @dataclasses.dataclass(frozen=True)
 class Collect:
-    """Guide a person through trajectories, and save the initial and the final pair of images of each."""
+    """Guide a person through trajectories, and save the images of each trajectory.
+
+    A trajectory has a visual and a tactile image of the held object, and a visual and a tactile image of the object at
+    rest.
+    """
 
     workdir: Folder = Path("runs/real")  # work directory. The trajectories go to its folder `dataset`
     camera: str | None = None  # path or URL of the camera, or a video file. None: the camera of the sensor file
@@ -176,8 +180,8 @@ def keep(file: Path, workdir: Path) -> None:
     if copy.exists():
         if hardware.Device.load(copy) != device:
             raise ValueError(
-                f"{copy} differs from {file}, but one sensor file must describe all trajectories of a session: choose "
-                "another --workdir"
+                f"{copy} differs from {file}, but one sensor file must describe all trajectories of a work directory: "
+                "choose another --workdir"
             )
         return
     for background in (device.background_visual, device.background_tactile):

@@ -108,7 +108,7 @@ def parse(presets: Mapping[str, Config], workdir: str, description: str | None) 
 
 
 def chosen_preset(presets: Mapping[str, Preset], words: Sequence[str]) -> Preset:
-    """Find the preset that `--preset` selects, or `default`.
+    """Return the preset that `--preset` selects. If the name is missing or unknown, return the preset `default`.
 
     Args:
         presets: Presets by name. The name `default` must be among them.

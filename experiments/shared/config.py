@@ -207,7 +207,10 @@ def _fits(model: Literal["statespace", "paper"], side: int, size: int) -> bool:
 
 
 def model_folder(workdir: Path, name: str, config: Config, split: str) -> Path:
-    """The folder of a model: `models/NAME` for the first split of the experiment, else `models/NAME-by-SPLIT`."""
+    """The folder of a model that was trained on one split of the data, "object" or "trajectory".
+
+    The folder is `models/NAME` for the first split in `config.splits`, and `models/NAME-by-SPLIT` for the other split.
+    """
     return workdir / "models" / (name if split == config.splits[0] else f"{name}-by-{split}")
 
 

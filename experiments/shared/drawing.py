@@ -26,7 +26,7 @@ def draw(
     """Draw the main model's predictions from vision and from all inputs, and the calibration of outcome probabilities.
 
     If the model predicts samples of the pose, further figures show the predicted and the re-rolled positions at rest.
-    A re-roll is another simulation of the same start, with newly drawn hidden properties such as friction.
+    A re-roll is another simulation from the same initial state, with new random hidden properties such as friction.
 
     Args:
         config: Configuration of the experiment.
@@ -36,19 +36,20 @@ def draw(
         test: Held-out trajectories.
         scores: Scores of the predictions. The keys are the titles of the rows in the tables.
         shown: Predictions of the first held-out trajectories. The keys are the titles of the rows.
-        possible: Re-rolls of the first held-out starts.
+        possible: Re-rolls of the first held-out trajectories.
 
     Returns:
         Paths of the figures.
     """
     drawn, model, scenario = [], TITLES[main_model(config)], config.collection.scenario
+    num_shown = min(config.num_shown, len(test.object))
     for given, name in (("visual", "predictions"), ("all inputs", "predictions-all")):
         found = shown.get(f"{model}, from {given}")
         if found is None:
             continue
-        title = f"{workdir.name}, from {given}: the first {config.num_shown} of the held-out list"
+        title = f"{workdir.name}, from {given}: the first {num_shown} held-out trajectories"
         drawn.append(figures / f"{name}.png")
-        evaluation.figures.predictions(drawn[-1], test, found, num=config.num_shown, title=title, scenario=scenario)
+        evaluation.figures.predictions(drawn[-1], test, found, num=num_shown, title=title, scenario=scenario)
         if found.samples is not None and found.samples.pose is not None:
             drawn.append(figures / f"{name.replace('predictions', 'ends')}.png")
             head = f"{workdir.name}, from {given}"

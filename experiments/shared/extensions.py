@@ -13,7 +13,9 @@ Log = Callable[[int, dict[str, float]], None]  # arguments: step of a record, ot
 
 @dataclasses.dataclass(frozen=True)
 class Extensions:
-    """Your own parts of an experiment. The default of each field selects the library's own part.
+    """Your own loss, optimiser, logger, metrics, table columns and modalities for an experiment.
+
+    A field that you do not set selects the library's own part, such as the library's loss.
 
     Functions cannot be compared. A finished model or table is therefore not made again if the code of a loss, an
     optimiser or a metric changes. After a change of the loss or the optimiser, use a new work directory. After a change
@@ -52,7 +54,7 @@ class Extensions:
 
     @property
     def scored(self) -> tuple[evaluation.Metric, ...]:
-        """All metrics: `metrics`, and the error of each further modality."""
+        """All metrics: those of the field `metrics`, and the error of each modality in `measurements`."""
         return (*self.metrics, *(evaluation.measurement_error(own) for own in self.measurements))
 
     def described(self) -> list[Any]:

@@ -12,6 +12,7 @@ from experiments.shared.extensions import NONE, Extensions
 from experiments.shared.progress import Bar, say
 from experiments.shared.rerolls import ceilings
 from sts_jax import dataset, evaluation, storage, training
+from sts_jax.dataset.measurement import NAMES
 from sts_jax.training import records
 
 # The main table has rows for the main model with the first five of these inputs that the model supports.
@@ -22,7 +23,7 @@ MAIN_SUBSETS = (
 
 
 class SplitPairs(NamedTuple):
-    """The first and last frames of a split.
+    """The first and last frames of the training, the validation and the held-out trajectories.
 
     The field `given` contains the held-out trajectories as inputs. The field `test` contains the same trajectories as
     targets. The images of `validation` and `given` have the resolution of the models' inputs. The images of `train` and
@@ -54,11 +55,14 @@ def evaluate(
         data: Dataset of the experiment.
         workdir: Work directory with the trained models.
         sensor: Sensor of the collection.
-        split: Split, one of `config.splits`.
+        split: Name of the split into training and held-out data, one of `config.splits`.
         own: Your own metrics, columns and modalities.
 
     Returns:
         The main table in Markdown.
+
+    Raises:
+        ValueError: `own.measurements` differs from the further modalities with which the main model was trained.
     """
     suffix = "" if split == config.splits[0] else f"-by-{split}"
     done, figures = workdir / f"metrics{suffix}.json", workdir / f"figures{suffix}"
@@ -69,6 +73,7 @@ def evaluate(
         return table.read_text()
     if done.exists() or table.exists():
         say(f"evaluate: again, because {reason}")
+    _check_measurements(model_folder(workdir, main_model(config), config, split), own)
     pairs, scenario = _pairs_of_split(config, data, split, own), config.collection.scenario
     judge, test = evaluation.scorer(scenario, pairs.train, metrics=own.scored), pairs.test
     possible = ceilings(
@@ -121,6 +126,17 @@ def _inputs(config: Config, data: dataset.Dataset, workdir: Path, split: str, ow
     if own.described() != NONE.described():
         inputs["the list of metrics"] = storage.digest(own.described())
     return inputs
+
+
+def _check_measurements(folder: Path, own: Extensions) -> None:
+    """Raise a `ValueError` unless `own.measurements` has the further modalities of the model in a folder."""
+    trained = sorted(set(sts.Predictor.load(folder).modalities) - set(NAMES))
+    given = sorted(measurement.name for measurement in own.measurements)
+    if given != trained:
+        raise ValueError(
+            f"measurements has {given}, but the model in {folder} was trained with {trained}: evaluate it with "
+            "Extensions(measurements=...) of the training, or train it again in a new work directory"
+        )
 
 
 def _pairs_of_split(config: Config, data: dataset.Dataset, split: str, own: Extensions) -> SplitPairs:
@@ -183,8 +199,8 @@ def _scored(
 def main_rows(model: str, titles: Sequence[str]) -> list[str]:
     """Titles of the rows of the main table: ceiling, baselines, and the main model with up to five sets of inputs.
 
-    The ceiling is the score of the mean result of re-rolls. A re-roll is another simulation of the same start, with
-    newly drawn hidden properties such as friction.
+    The ceiling is the score of the mean result of re-rolls. A re-roll is another simulation from the same initial
+    state, with new random hidden properties such as friction.
 
     Args:
         model: Title of the main model.

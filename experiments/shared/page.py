@@ -52,8 +52,8 @@ class Page(Site):
             content: Decoded JSON with `action`, and with the `stage` and the `number` of the trajectory on the page.
 
         Returns:
-            True if the action is accepted, or False if the content is invalid or the page showed an old stage or
-            trajectory. The action `stop` is accepted even from a page with an old stage or trajectory.
+            True if the action is accepted. An action is refused if the content is invalid, or if no view was shown yet.
+            It is also refused if the page showed an old stage or trajectory, unless the action is `stop`.
         """
         with self._changed:
             view = self._view

@@ -13,8 +13,9 @@ from sts_jax import dataset, evaluation
 def draw_strip(path: Path, collection: dataset.Collection, sensor: sts.Sensor, data: dataset.Dataset) -> None:
     """Draw a trajectory of a dataset as a strip of pictures.
 
-    Only fully rendered trajectories are considered. They have images of every frame. The function draws the one whose
-    outcome comes earliest in the scenario's list of outcomes. If several of them have this outcome, it draws the first.
+    The drawn trajectory is fully rendered, which means that the dataset has images of each of its frames. If there are
+    several such trajectories, the function draws the first one that has the earliest outcome in the list
+    `collection.scenario.outcomes`.
 
     Args:
         path: Path of the picture.

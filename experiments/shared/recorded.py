@@ -76,12 +76,14 @@ def check(config: Config) -> None:
 def read(config: Config, workdir: Path) -> Recorded:
     """Read the confirmed trajectories of a work directory, rectify the images, and hold out validation trajectories.
 
+    A trajectory is confirmed if it has the file `confirmed.json`.
+
     Args:
         config: Configuration of the experiment.
         workdir: Work directory with the folder `dataset` and the sensor file.
 
     Raises:
-        FileNotFoundError: There is no session, or no sensor file.
+        FileNotFoundError: The work directory has no `dataset/session.json`, or no sensor file.
         ValueError: There are too few trajectories. Or the sensor file is invalid, names no background images (images of
             the empty pad), or does not fit the images. Or a background image is missing or damaged.
         OSError: Another file is damaged.
@@ -205,15 +207,18 @@ def jobs(config: Config, data: Recorded) -> Iterator[stages.Job]:
 
 
 def augmented(config: Config, images: np.ndarray, empty: np.ndarray) -> np.ndarray:
-    """Add shifted copies of a stream's image pairs, and copies in which the final image replaces the initial image.
+    """Add shifted copies of image pairs, and copies in which the final image replaces the initial image.
+
+    Each pair gets `config.shifts` shifted copies. If `config.rest` is True, every pair and every shifted copy is then
+    added once more, with the final image in place of the initial image.
 
     Args:
         config: Configuration of the experiment.
-        images: Initial and final images, uint8 of shape (n, 2, size, size, 3).
+        images: Pairs of an initial and a final image, all visual or all tactile, uint8 of shape (n, 2, size, size, 3).
         empty: Image of the empty pad, uint8 of shape (size, size, 3).
 
     Returns:
-        Images of all samples, uint8 of shape (samples, 2, size, size, 3).
+        The given pairs, followed by the copies, uint8 of shape (samples, 2, size, size, 3).
     """
     random, far = np.random.default_rng(config.seed), config.largest_shift
     parts = [images]

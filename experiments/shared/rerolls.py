@@ -54,7 +54,7 @@ def ceilings(
     Args:
         workdir: Work directory.
         suffix: Suffix of the file names, different for each split of the dataset.
-        collection: Collection of the experiment.
+        collection: Description of the dataset, with the scenario and the physics engine of the simulation.
         sensor: Sensor that renders the last frames of the re-rolls.
         data: Dataset of the experiment.
         test: Held-out trajectories.
@@ -99,7 +99,7 @@ def reroll(
     friction.
 
     Args:
-        collection: Collection of the experiment.
+        collection: Description of the dataset, with the scenario and the physics engine of the simulation.
         sensor: Sensor that renders the last frames of the re-rolls.
         test: Trajectories to re-roll.
         times: Number of re-rolls of each trajectory.

@@ -87,12 +87,12 @@ def draw(folder: Path, numbers: tuple[int, ...], path: Path) -> None:
     """Draw trajectories as rows of four images: initial visual and tactile, final visual and tactile.
 
     Args:
-        folder: Folder of the session.
+        folder: Folder `dataset` of a work directory, which contains the trajectories.
         numbers: Numbers of the trajectories. If empty, the newest `SHEET` trajectories are drawn.
         path: Path of the picture.
 
     Raises:
-        ValueError: A number belongs to no confirmed trajectory, or the session has no confirmed trajectory.
+        ValueError: A number belongs to no confirmed trajectory, or `folder` has no confirmed trajectory.
     """
     recordings = hardware.load_recordings(folder)
     if unknown := set(numbers) - set(recordings.numbers):

@@ -60,7 +60,8 @@ class Hand(twin.Hand):
     def show(self, view: View) -> None:
         """Move the object as `hardware.collect` instructs in `view`, and show the number of confirmed trajectories.
 
-        If a problem has occurred since the last view, its message is shown too.
+        `view.problem` is the message of an error that prevents collecting. It is printed if the
+        previous view had no problem.
         """
         super().show(view)
         self._bar("collect", view.confirmed, self._count)
@@ -72,11 +73,11 @@ class Hand(twin.Hand):
 
 
 def collect(config: Simulated) -> None:
-    """Collect trajectories of the twin until there are `config.count`, or continue an interrupted collection.
+    """Collect trajectories of the twin until the work directory has `config.count` confirmed trajectories.
 
     The twin (`ObjectScene`) simulates a fixed sequence of trajectories for each seed. A recorded trajectory keeps its
-    number in this sequence. A continued collection starts with the largest recorded number plus 1, so that no
-    trajectory is repeated.
+    number in this sequence. If a collection was interrupted, the next call continues it with the largest recorded
+    number plus 1, so that no trajectory is repeated.
 
     Raises:
         ValueError: The work directory contains data of another sensor, or of a twin with another seed, image size or
@@ -122,7 +123,11 @@ def lens(config: Simulated, sensor: sts.Sensor) -> hardware.Lens:
 
 @contextlib.contextmanager
 def started(config: Simulated, first: int) -> Iterator[twin.Twin]:
-    """Start a twin whose next trajectory has the number `first`, and close it afterwards."""
+    """Start a twin, and close it at the end of the `with` block.
+
+    The twin simulates a fixed sequence of trajectories for each seed. Its next trajectory is number `first` of this
+    sequence.
+    """
     sensor, resolution = sts.Sensor(), config.size[::-1]
     scene = twin.ObjectScene(
         sts.objects.make(jax.random.key(config.seed), OBJECT),
@@ -138,10 +143,11 @@ def started(config: Simulated, first: int) -> Iterator[twin.Twin]:
 
 
 def commissioned(config: Simulated, device: twin.Twin) -> tuple[twin.VirtualSensor, EmptyPad]:
-    """Make a `VirtualSensor` and an `EmptyPad` of the twin from the sensor file in the work directory.
+    """Make the objects that read images of the twin and describe its empty pad, from the sensor file.
 
-    If the file is missing, `commission` writes it first. The settling times of the sensor come from the file. The
-    `EmptyPad` is computed from the background images that the file names.
+    If the work directory has no sensor file, `commission` writes it first. The `VirtualSensor` gets the settling times
+    of the file, which are the waiting times after the LEDs are switched. The `EmptyPad` is computed from the background
+    images that the file names.
 
     Raises:
         ValueError: The sensor file was written with another image size or with other LED levels.

@@ -67,7 +67,10 @@ class Site(abc.ABC):
 
     @abc.abstractmethod
     def facts(self) -> dict[str, Any]:
-        """The content of the page besides images, for JSON. The entry `ended` is True if the program has ended."""
+        """The content of the page without the images, as a dictionary of JSON values.
+
+        The entry `ended` is True if the program has ended.
+        """
 
     @abc.abstractmethod
     def image(self, stream: str) -> Image | None:
@@ -111,15 +114,15 @@ class Site(abc.ABC):
         return time.monotonic() - self._asked_s < _OPEN_S
 
     def asked(self) -> dict[str, Any]:
-        """Return the facts (the content of the page besides images), and record the time of this request."""
+        """Return the content of the page without the images (`facts`), and record the time of this request."""
         self._asked_s = time.monotonic()
         return self.facts()
 
     def wait(self, last: int) -> int | None:
-        """Wait until the content of the page has changed more than `last` times, or the program has ended.
+        """Wait until the page's content has changed more than `last` times in total, or until the program has ended.
 
         Returns:
-            The number of changes so far, or None if the program has ended.
+            The total number of changes so far, or None if the program has ended.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._ended or self._number > last)

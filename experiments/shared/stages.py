@@ -29,16 +29,16 @@ def main(config: Config, workdir: Path, *, only: Stage | None = None, own: Exten
 
     Raises:
         ValueError: A field of the configuration is out of range, the work directory has another configuration, or a
-            model in it was trained with another choice of loss or optimiser or with other notes. Also raised if
-            `own.measurements` is given for other models than the paper's.
+            model in it was trained with another choice of loss or optimiser or with other `own.notes`. Also raised if
+            `own.measurements` is given, but `config.model` is not "paper".
         FileNotFoundError: A stage before `only` has not been run.
         LockedError: Another process works in the work directory.
     """
     check(config)
     if own.measurements and config.model != "paper":
         raise ValueError(
-            f"measurements has {own.measurements[0].name!r}, but only the paper's model with all modalities accepts "
-            "further modalities: choose a configuration with model='paper'"
+            f"measurements must be empty for model={config.model!r}, got the modality {own.measurements[0].name!r}: "
+            "remove it, or use model='paper', because only the paper's model with all modalities accepts further ones"
         )
     sensor = sts.Sensor()
     with storage.lock(workdir):
@@ -242,6 +242,8 @@ def run(
 
 def calibrate(job: Job, model: statespace.Config, folder: Path, config: Config, validation: dataset.Pairs) -> None:
     """Calibrate a trained state-space model on the validation trajectories, and write `calibration.json`.
+
+    The calibration corrects the density of the predicted pose and the probabilities of the outcomes for new objects.
 
     Args:
         job: The training of the model, from `jobs`. Only its preprocessing and its images of the untouched sensor are

@@ -119,12 +119,12 @@ def draw(config: Config, data: Recorded, predicted: Mapping[str, Predicted], pat
 
 
 def as_table(config: Config, data: Recorded, summary: dict, logs: Mapping[str, list[dict]]) -> str:
-    """Format the table in Markdown.
+    """Write the table of the models' scores (Table 2 of the paper) as text in Markdown.
 
     Args:
         config: Configuration of the experiment.
         data: Recorded trajectories.
-        summary: Scores with intervals, from `evaluation.image_summary`.
+        summary: Scores with 95 % intervals, from `evaluation.image_summary`.
         logs: Training logs by the title of the model.
     """
     names = [FLOOR, *dict.fromkeys(name for own in summary.values() for name in own["predictors"])]

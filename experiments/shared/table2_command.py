@@ -24,7 +24,10 @@ _STEPS = 4  # number of gradient steps in a measurement
 
 @dataclasses.dataclass(frozen=True)
 class Train:
-    """Train VAE visual, VAE tactile and MVAE without pose on the collected trajectories, and write Table 2."""
+    """Train the models of the paper's Table 2 on recorded trajectories, and write the table.
+
+    The models are VAE visual, VAE tactile and MVAE without pose.
+    """
 
     # configuration of the preset. Each of its fields is an option
     config: Annotated[Config, tyro.conf.arg(name="")]

@@ -30,7 +30,7 @@ from sts_jax.storage import claim, digest, lock, read_json
 
 
 class Collected(NamedTuple):
-    """The result of `collect`: a summary of the whole dataset."""
+    """The result of `collect`: how many trajectories were sampled again, and which objects the dataset lacks."""
 
     resampled: int  # number of trajectories that were discarded and sampled again
     left_out: tuple[str, ...]  # one line for each object that the dataset lacks, with the reason
@@ -132,8 +132,8 @@ def _make_shard(
     left_out += failed
     if trajectory is None:
         raise ValueError(
-            f"{folder}: no object of shard {index} can be simulated: use other objects or another scenario. One of the "
-            f'errors is "{left_out[-1]}"'
+            f"{folder}: none of the objects {members[0]} to {members[-1]} (shard {index}) can be simulated: use other "
+            f'objects or another scenario. One of the errors is "{left_out[-1]}"'
         )
     members, bodies = np.array(list(found)), list(found.values())
     frames = _frames_of(collection, members, trajectory)

@@ -311,8 +311,8 @@ class Dataset:
 
         Raises:
             ValueError: An index is not a whole number or is out of range, or its trajectory has no images. Two
-                measurements have the same name, or a function of a measurement is missing or returns a wrong shape,
-                type or value.
+                measurements have the same name, or a measurement has no function `turn` although `symmetries` is True
+                and the dataset contains copies, or `measure` or `turn` returns a wrong shape, type or value.
             FileNotFoundError: A shard is missing.
             DamagedFileError: A shard is damaged. The message names it.
         """
@@ -320,8 +320,9 @@ class Dataset:
         without = trajectories[~np.isin(trajectories, self.rendered())]
         if without.size:
             raise ValueError(
-                f"`trajectories` contains {without[0]}, which has no images (num_rendered="
-                f"{self.collection['num_rendered']}): use `ends`, or take indices from `members` or `rendered`."
+                f"`trajectories` contains {without[0]}, which has no images "
+                f"(num_rendered={self.collection['num_rendered']} is the number of trajectories with images per object)"
+                ": use `ends`, which needs no images, or take indices from `members` or `rendered`."
             )
         last = self.trajectory["pose"].shape[1] - 1
         kinds = np.unique(self.frames[:, 2]).tolist() if symmetries else [0]

@@ -128,7 +128,7 @@ def _checked(measurement: Measurement, function: str, values: Any, count: int) -
     with np.errstate(over="ignore"):
         values = values.astype(np.float32)
     if np.isinf(values).any():
-        raise ValueError(f"{start}infinite numbers, but a value must be finite, or NaN if it was not measured")
+        raise ValueError(f"{start}infinite numbers: return finite numbers, and NaN for values that were not measured")
     if measurement.is_image and (np.nanmin(values, initial=0) < 0 or np.nanmax(values, initial=0) > 1):
         raise ValueError(
             f"{start}an image with values from {np.nanmin(values):.3g} to {np.nanmax(values):.3g}, but an image must "

@@ -1,4 +1,6 @@
-"""Shards on disk. A file is written as a whole or not at all, and the same inputs give the same bytes.
+"""Reading and writing of shards, the files of a dataset.
+
+A file is written as a whole or not at all, and the same inputs give the same bytes.
 
 A shard is a pair of files with the data of some objects. `NAME.array_record` has one record per rendered frame: the
 visual image, the tactile image (`uint8`, `(height, width, 3)`) and the segmentation (bits), in that order. The frames
@@ -34,7 +36,7 @@ WRITER_OPTIONS = "group_size:1,zstd:3"
 
 
 class Images(NamedTuple):
-    """Rendered frames in the form in which a dataset stores them."""
+    """The visual images, tactile images and segmentations of n rendered frames, as a dataset stores them."""
 
     visual: np.ndarray  # uint8 (n, height, width, 3)
     tactile: np.ndarray  # uint8 (n, height, width, 3)

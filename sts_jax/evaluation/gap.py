@@ -1,7 +1,8 @@
 """Distances between real and simulated images: per pixel, in a feature space, and by a classifier.
 
-The distances compare a set of real images with a set of simulated images. Images are uint8 `(n, height, width, 3)` of
-one stream. Each image has a group number, which is the number of its trajectory.
+The distances compare a set of real images with a set of simulated images. Images are uint8 `(n, height, width, 3)`.
+All images of a comparison are visual images, or all are tactile images. Each image has a group number, which is the
+number of its trajectory.
 
 The two sets are matched if both contain the same groups. In matched sets, image i of the real set and image i of the
 simulated set must show the same object in the same pose. Sets that are not matched must have no group in common.
@@ -297,10 +298,10 @@ def _matched(
         return False
     if set(common) != set(np.r_[real_group, simulated_group]) or len(real) != len(simulated):
         raise ValueError(
-            f"real_group has {len(real)} images, simulated_group has {len(simulated)} images, and the number of "
-            f"common trajectories is {len(common)}. The two sets must have either no common trajectory, or the same "
-            "trajectories and the same number of images: keep only the images that have a counterpart in the other "
-            "set, or give the simulated images other trajectory numbers"
+            "the real and the simulated images must have either no common trajectory, or the same trajectories and the "
+            f"same number of images. Number of common trajectories: {len(common)}. Number of images: {len(real)} real, "
+            f"{len(simulated)} simulated. Keep only the images that have a counterpart in the other set, or give the "
+            "simulated images other trajectory numbers"
         )
     return True
 

@@ -1,4 +1,4 @@
-"""Makes the error metric of a further modality from its `dataset.Measurement`."""
+"""Makes a metric for the error of a predicted measurement, such as a contact force or an image of a second camera."""
 
 import numpy as np
 
@@ -8,10 +8,13 @@ from sts_jax.evaluation.records import Judged, Metric, Statistic, mean
 
 
 def measurement_error(measurement: Measurement) -> Metric:
-    """Make the metric for the error of a further modality in the predicted last frame.
+    """Make the metric for the error of one measurement in the predicted last frame.
+
+    A measurement is a quantity of a trajectory's first and last frames, in addition to the visual image, the tactile
+    image and the pose. Examples are the contact force and an image of a second camera.
 
     Args:
-        measurement: The specification of the modality.
+        measurement: The specification of the measurement.
 
     Returns:
         The metric `NAME_error`. It is a mean over the held-out trajectories whose last frame was measured. For a

@@ -341,7 +341,7 @@ def auc(positive: np.ndarray, score: np.ndarray, weight: np.ndarray | None = Non
         weight: Weights of the items, `(n,)` (default: 1).
 
     Returns:
-        The area, or NaN without a positive item or without a negative item. Items with the weight 0 are ignored.
+        The area. It is NaN if no item is positive, or if no item is negative. Items with the weight 0 are ignored.
     """
     w = np.ones(len(score)) if weight is None else weight
     _, place = np.unique(score, return_inverse=True)

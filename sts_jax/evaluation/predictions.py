@@ -82,7 +82,10 @@ class Forecaster(Protocol):
 
     @property
     def modalities(self) -> tuple[str, ...]:
-        """The inputs that the model accepts: any of `visual`, `tactile`, `pose` and further modalities."""
+        """The inputs that the model accepts: any of `visual`, `tactile`, `pose` and names of measurements.
+
+        A measurement (`dataset.Measurement`) is an additional quantity, such as the contact force.
+        """
 
     @property
     def preprocessing(self) -> training.Preprocessing:
@@ -113,7 +116,7 @@ class Forecaster(Protocol):
         """Predict the last frame without a measurement, from the prior distribution of the model.
 
         Args:
-            shape: Leading axes of the prediction.
+            shape: Sizes of the leading axes of the predictions. The default is a single prediction.
             condition: Known quantities of the scenario in SI units, such as an acceleration of the pad, as an array
                 `(*shape, c)` for c quantities. None for scenarios without such quantities.
 
@@ -197,8 +200,8 @@ def predict(
         lacking = set(names) - set(NAMES) - set(test.measurements if pairs is None else pairs.measurements)
         if lacking:
             raise ValueError(
-                f"`{name}` lacks {', '.join(sorted(lacking))}: pass measurements=... to Dataset.pairs for all parts of "
-                "the dataset"
+                f"`{name}.measurements` lacks {', '.join(map(repr, sorted(lacking)))}: pass measurements=... to "
+                "Dataset.pairs for all parts of the dataset"
             )
 
     def run(pairs: Pairs, num_samples: int) -> Predicted:

@@ -1,4 +1,8 @@
-"""The baselines, which predict without a trained model, and the names of the tables' rows without a model."""
+"""The baselines, which predict the last frame without a trained model.
+
+The module also contains the names of the predictors that need no trained model: the baselines, and the two predictions
+from repeated simulation (`evaluation.ceiling`).
+"""
 
 import numpy as np
 

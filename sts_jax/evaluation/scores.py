@@ -46,8 +46,8 @@ def score(
         outcomes: The outcomes of the scenario, `scenario.outcomes`. They are needed if the prediction has
             `outcome_probability`.
         frequency: Frequency of each of the c outcomes among the training trajectories, `(c,)`, from
-            `evaluation.frequency`. If `frequency` is None, the predicted outcome is `predicted.outcome`, or the outcome
-            with the largest probability if `predicted.outcome` is None.
+            `evaluation.frequency`. If `frequency` is None, the predicted outcome is `predicted.outcome`. If
+            `predicted.outcome` is also None, the predicted outcome is the outcome with the largest probability.
         metrics: The metrics of the evaluation. For each metric that has a function `Metric.errors`, `score` calls this
             function and stores the result in `Scores.further`.
 
@@ -143,9 +143,9 @@ def _further(predicted: Predicted, test: Pairs, metrics: Sequence[Metric]) -> di
         found[metric.name] = np.asarray(values, np.float64)
         if found[metric.name].shape != (len(test.object),):
             raise ValueError(
-                f"metric {metric.name!r}: its function `errors` returned the shape {found[metric.name].shape}, but it "
-                f"must return one number per item, shape {(len(test.object),)}: reduce the other axes, for instance by "
-                "a mean"
+                f"metric {metric.name!r}: its function `errors` returned an array of shape "
+                f"{found[metric.name].shape}, but the array must have one number per item and the shape "
+                f"{(len(test.object),)}: reduce the other axes, for instance by a mean"
             )
     return found or None
 

@@ -106,7 +106,9 @@ def summarise(
 
 
 def gain(before: Scores, after: Scores, test: Pairs, *, num: int = 2000, seed: int = 0) -> dict | None:
-    """Compute the relative reduction of the outcome's log loss from one predictor to another: 1 - after / before.
+    """Compute the relative reduction of the outcome's log loss from one predictor to another.
+
+    The reduction is `1 - b / a`, where a is the mean log loss of the first predictor, and b is that of the second one.
 
     Args:
         before: Scores of the first predictor, for instance from vision.
@@ -116,7 +118,8 @@ def gain(before: Scores, after: Scores, test: Pairs, *, num: int = 2000, seed: i
         seed: Seed of the bootstrap.
 
     Returns:
-        `value` and the limits `low` and `high` of its 95 % interval. None if a predictor has no outcome probabilities.
+        A dictionary of the reduction `value` and of the limits `low` and `high` of its 95 % interval. The result is
+        None if a predictor has no outcome probabilities, or if the reduction is not finite.
     """
     if before.log_loss is None or after.log_loss is None:
         return None

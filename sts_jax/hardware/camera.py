@@ -160,8 +160,8 @@ class Camera:
             exposure: New exposure, > 0, in the driver's unit (V4L2: 0.1 ms).
 
         Returns:
-            The exposure that the device has now. Drivers round and limit the given value. None if the driver does not
-            support a manual exposure.
+            The exposure that the device has now. It may differ from the argument `exposure`, because drivers round and
+            limit this value. The result is None if the driver does not support a manual exposure.
 
         Raises:
             CameraError: The source is a stream or a file, the camera is not connected, or no frame has arrived within

@@ -119,7 +119,7 @@ class Capture:
             return False
 
     def retrieve(self) -> UInt8[np.ndarray, "height width 3"] | None:
-        """Decode the frame of the last `grab` and return it as RGB, or None if it is damaged."""
+        """Decode the frame of the last `grab` to an RGB image. The result is None if the frame is damaged."""
         try:
             complete, image = self.properties.retrieve()
             if not complete or image is None or not image.size:

@@ -58,7 +58,7 @@ class View:
 
 @runtime_checkable
 class PairReader(Protocol):
-    """A sensor that returns pairs of a visual and a tactile image, such as `STS` or the twin's `VirtualSensor`."""
+    """A sensor that returns pairs of a visual and a tactile image, such as `STS` or the simulated `VirtualSensor`."""
 
     def read(self) -> Pair:
         """Return a new visual and a new tactile image. Both arrive after the beginning of the call."""

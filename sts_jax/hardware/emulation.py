@@ -1,4 +1,6 @@
-"""A software emulation of the LED controller. It answers protocol requests, and the caller passes the current time.
+"""A software emulation of the LED controller, which answers the requests of the serial protocol.
+
+The emulation has no clock. The caller therefore passes the current time in each call.
 
 The tests run the real controller's firmware in a simulator of its microcontroller, and compare the answers of the
 firmware with the answers of the emulation.

@@ -5,10 +5,10 @@ places an object on the pad and holds it (stages `PLACE` and `HOLD`), releases i
 (`STILL`).
 
 Each image is divided into 24 rows of 32 blocks. A movement is a change of a block's mean colour between two images. The
-noise of single pixels averages out in the mean colour. A contact is a difference between a mean colour and the mean
-colour of the same block on the empty pad. Contacts are detected in blocks of half the width and height, because a
-contact can be small. Changes and differences count only if they exceed a threshold. The threshold is a multiple of the
-noise that the mean colour has on the empty pad.
+noise of single pixels averages out in the mean colour. A contact is detected if the mean colours of some blocks differ
+between the current tactile image and a tactile image of the empty pad. The blocks for contacts have half the width and
+height of the other blocks, because a contact can be small. Changes and differences count only if they exceed a
+threshold. The threshold is a multiple of the noise that the mean colour has on the empty pad.
 """
 
 import dataclasses
@@ -182,11 +182,13 @@ def _noise(looks: Float[np.ndarray, "n rows columns 3"]) -> Float[np.ndarray, "r
 
 
 def known_pad(visual: UInt8[np.ndarray, "height width 3"], tactile: UInt8[np.ndarray, "height width 3"]) -> EmptyPad:
-    """Make an `EmptyPad` from the images of the empty pad in a sensor file.
+    """Make an `EmptyPad` from one visual and one tactile image of the empty pad.
 
-    `Device.background` reads these images. The noise in the result is 0, because noise cannot be measured from a single
-    image. If the noise is 0, `has_contact` uses an estimate of the noise from the image that it tests. Later, `step`
-    measures the noise before each trajectory, and the measured value replaces the 0.
+    A sensor file, which describes a real sensor, refers to two such images. `Device.background` reads them.
+
+    The noise in the result is 0, because noise cannot be measured from a single image. If the noise is 0, `has_contact`
+    uses an estimate of the noise from the image that it tests. Later, `step` measures the noise before each trajectory,
+    and the measured value replaces the 0.
 
     Args:
         visual: Raw image of the empty pad without light, RGB.
@@ -293,9 +295,10 @@ def discard(state: State) -> State:
 
 
 def interrupted(state: State) -> State:
-    """Restart the measurement of the time without movement. Call this function after a gap in the images.
+    """Restart the guide's measurement of the time for which nothing has moved in the images.
 
-    An object may have moved during the gap, for example while the camera was disconnected.
+    Call this function after a gap in the images, for example after the camera was disconnected. An object may have
+    moved during the gap.
 
     Args:
         state: Current state of the guide.
@@ -312,13 +315,15 @@ def _enter(state: State, stage: Stage) -> State:
 def has_contact(config: GuideConfig, empty: EmptyPad, observation: Observation) -> bool:
     """Return True if the tactile image shows a contact.
 
-    The tactile image is divided into 48 rows of 64 small blocks. The function computes the difference of each small
-    block from the same block of the empty pad. The median of these differences is then subtracted from each difference,
-    so that a change in the brightness of the whole image is not a contact. The image shows a contact if the remaining
-    differences of at least `config.contact_blocks` small blocks exceed a threshold. The threshold is
-    `config.deviations` times the noise, but at least `config.smallest_change` and at most `config.largest_threshold`.
-    The noise is the larger of two estimates: `sqrt(1 + 1 / config.pairs)` times the noise in `empty`, and 1.4826 times
-    the median absolute value of the remaining differences.
+    The tactile image is divided into 48 rows of 64 small blocks. The mean colour of the empty pad is subtracted from
+    the mean colour of the image in each block. The median of these differences over all blocks is then subtracted from
+    each difference, so that a change in the brightness of the whole image is not a contact. The image shows a contact
+    if the magnitude of the remaining difference exceeds a threshold in at least `config.contact_blocks` blocks.
+
+    The threshold is `config.deviations` times the standard deviation of the noise of a difference, but at least
+    `config.smallest_change` and at most `config.largest_threshold`. The standard deviation is the larger of two
+    estimates: `empty.imprint_noise * sqrt(1 + 1 / config.pairs)`, and 1.4826 times the median absolute value of the
+    remaining differences.
 
     Args:
         config: Thresholds.
@@ -380,9 +385,13 @@ _HINTS = {
 
 
 def instruction(config: GuideConfig, state: State) -> str:
-    """Return the text of the instruction for the person.
+    """Return the instruction for the person who records a trajectory, such as "Hold the object still."
 
-    The text also contains a hint if the guide has been in the same stage for at least `config.hint_s` seconds.
+    If the guide has been in the same stage for at least `config.hint_s` seconds, most instructions also contain a hint.
+
+    Args:
+        config: Thresholds and times of the guide.
+        state: Current state of the guide.
     """
     if state.stage is Stage.CLEAR and state.empty is None and not state.trusted:
         return f"{_INSTRUCTIONS[Stage.CLEAR]} Then confirm."

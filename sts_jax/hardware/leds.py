@@ -1,4 +1,7 @@
-"""Control of the sensor's lights through its LED controller, with proof that no light changed between two requests."""
+"""Control of the sensor's lights through its LED controller.
+
+`Lit.unchanged_since` compares two answers of the controller, and returns whether the lights changed between them.
+"""
 
 import contextlib
 import dataclasses
@@ -242,9 +245,9 @@ class Leds:
     def reconnect(self, *, limit_s: float = 30.0) -> None:
         """Search for the controller after its port has vanished, connect to it again, and turn its lights off.
 
-        The controller is recognised by its serial number. The previous port is tried first, then all other ports
-        whose USB device has the controller's vendor and product. The wait between attempts begins at 0.1 s and doubles
-        up to 5 s. Requests of other threads raise `DisconnectedError` meanwhile.
+        The controller is recognised by its serial number. The previous port is tried first, then all other ports with
+        the USB vendor ID and product ID of the controller. The wait between attempts begins at 0.1 s and doubles up to
+        5 s. Requests of other threads raise `DisconnectedError` meanwhile.
 
         Args:
             limit_s: Time after which no further attempt begins (s). An attempt takes at most `timeout_s + 2 * answer_s`

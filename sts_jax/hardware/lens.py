@@ -87,8 +87,8 @@ class Lens:
                 raise ValueError(f"{name} must be > 0, got {getattr(self, name)}")
         if self.translation[2] <= 0:
             raise ValueError(
-                f"the third number of translation must be > 0, so that the pad is in front of the camera, got "
-                f"{self.translation}"
+                f"translation[2] must be > 0 m, so that the pad is in front of the camera, got translation = "
+                f"{self.translation} m"
             )
         if self.center[2] >= 0:
             raise ValueError(

@@ -1,4 +1,4 @@
-"""`ProvenFrames`: switches the lights, and selects frames for which the state of the lights is proven."""
+"""`ProvenFrames`: takes camera frames for which the LED controller has confirmed that the lights did not change."""
 
 import contextlib
 import time
@@ -33,12 +33,15 @@ _GRACE_S = 0.2  # s by which the wait for a frame may exceed the deadline, so th
 
 
 class ProvenFrames:
-    """Switches the lights of a connected sensor, and selects frames for which the state of the lights is proven.
+    """Switches the lights of a connected sensor, and takes frames that are proven to show the new state of the lights.
 
-    The lights are off in the visual stream and on in the tactile stream. After each switch of the lights, the frames
-    are compared with a frame from before the switch, until two successive frames show the new state of the lights.
-    After each selected frame, the controller must confirm that the lights have not changed since the switch. Only one
-    thread may take images. Other threads may only call `stop`.
+    The lights are off in the visual stream and on in the tactile stream. The proof consists of two checks:
+
+    - After each switch of the lights, the frames are compared with a frame from before the switch. Frames are discarded
+      until two successive frames show the new state of the lights.
+    - After each taken frame, the controller must confirm that the lights have not changed since the switch.
+
+    Only one thread may take images. Other threads may only call `stop`.
     """
 
     def __init__(
@@ -172,8 +175,8 @@ class ProvenFrames:
         once for a pair.
 
         Args:
-            deadline: Latest time on the clock `time.monotonic` (s). If the LED controller is lost during the call,
-                the deadline is extended by the duration of the reconnection.
+            deadline: Time on the clock `time.monotonic` at which the wait for frames ends (s). If the LED controller is
+                lost during the call, the deadline is extended by the duration of the reconnection.
 
         Returns:
             The two images.
@@ -201,8 +204,8 @@ class ProvenFrames:
 
         Args:
             stream: Stream of the image, "visual" (lights off) or "tactile" (lights on).
-            deadline: Latest time on the clock `time.monotonic` (s). If the LED controller is lost during the call,
-                the deadline is extended by the duration of the reconnection.
+            deadline: Time on the clock `time.monotonic` at which the wait for frames ends (s). If the LED controller is
+                lost during the call, the deadline is extended by the duration of the reconnection.
             after_s: Earliest arrival time of the frame on the same clock (s).
             then: Stream for which the lights are set after the frame. None: the lights do not change.
 

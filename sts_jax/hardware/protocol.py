@@ -1,8 +1,8 @@
 """The serial protocol of the LED controller: messages as dataclasses, and their encoding as lines of text.
 
-A line consists of ASCII text, `*`, the checksum of the text in four hexadecimal digits, and a newline: `7 PING*018E`.
-The host sends requests, and the controller answers each request with one reply of the same sequence number. The page
-docs/hardware/protocol.md defines the requests and the replies.
+A line consists of ASCII text, `*`, the checksum of the text in four hexadecimal digits, and a newline. For example,
+`7 PING*018E` is a request with the sequence number 7. The host sends requests, and the controller answers each request
+with one reply of the same sequence number. The page docs/hardware/protocol.md defines the requests and the replies.
 
 Parsing is strict: each message has exactly one valid line. Any other line raises a `ProtocolError`.
 """
@@ -239,9 +239,9 @@ def decode_request(line: bytes) -> Request:
             return Watch(sequence, number)
         case ["HELLO" | "SET" | "PING" | "WATCH", *_]:
             raise ProtocolError(
-                f"arguments are missing, too many or out of range in the line {line!r}: HELLO needs a version in "
-                f"0..65535, SET needs {CHANNELS} levels in 0..255, PING needs no arguments, and WATCH needs a period "
-                f"in {SHORTEST_WATCH_MS}..{LONGEST_WATCH_MS} ms",
+                f"the line {line!r} has a wrong number of arguments or an argument that is out of range: HELLO needs "
+                f"a version in 0..65535, SET needs {CHANNELS} levels in 0..255, PING needs no arguments, and WATCH "
+                f"needs a period in {SHORTEST_WATCH_MS}..{LONGEST_WATCH_MS} ms",
                 Code.ARGUMENTS,
                 sequence,
             )
@@ -286,8 +286,8 @@ def decode_reply(line: bytes) -> Reply:
     found = _reply(decode(line).split(" "))
     if found is None:
         raise ProtocolError(
-            f"the line {line!r} is not a reply of the LED controller's protocol: docs/hardware/protocol.md defines the "
-            "replies",
+            f"the line {line!r} is not a reply of the LED controller's protocol: compare it with the replies in "
+            "docs/hardware/protocol.md",
             Code.ARGUMENTS,
         )
     return found

@@ -61,7 +61,8 @@ class RecordedTrajectory:
 class Entry(NamedTuple):
     """A trajectory in the result of `list_recordings`: its number, state, time and note.
 
-    The field `standing` holds the state of the trajectory: "confirmed", "unconfirmed", "incomplete" or "discarded".
+    The field `standing` holds the state of the trajectory: "confirmed", "unconfirmed" (both pairs of images exist),
+    "incomplete" (a pair of images is missing) or "discarded".
     """
 
     number: int  # number of the trajectory in its session
@@ -203,7 +204,9 @@ def read_session(folder: Path) -> dict[str, Any]:
 
 
 def confirm_recording(folder: str | os.PathLike, number: int, note: str = "") -> None:
-    """Confirm a trajectory, so that `load_recordings` includes it. The session must not be open.
+    """Confirm a trajectory, so that `load_recordings` includes it.
+
+    Call this function only while no `Session` is open in the folder.
 
     Args:
         folder: Folder of the session.

@@ -148,7 +148,7 @@ class Device:
         """Return the camera configuration that this `Device` describes, with the exposure for visual images.
 
         If the source is a network stream or a video file, the configuration contains only the image size and the frame
-        rate, and `lock` is False.
+        rate. Its field `lock` is then False, because only the settings of a camera device can be locked.
 
         Args:
             source: Another path or URL of the same camera, such as its URL with a password. None: the path or URL in

@@ -168,7 +168,7 @@ class Session:
 
     @property
     def problem(self) -> str | None:
-        """Message of the error that prevents writing at present, or None."""
+        """Message of the error that prevents writing at present. None if there is no such error."""
         with self._changed:
             if self._error is None:
                 return None

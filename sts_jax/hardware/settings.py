@@ -51,7 +51,14 @@ class Refusal:
 
 
 def asked(config: CameraConfig) -> dict[str, float]:
-    """Return the values of `exposure`, `gain`, `white_balance` and `focus` that are not None, by field name."""
+    """Return the values that a camera configuration requests for exposure, gain, white balance and focus.
+
+    Args:
+        config: Camera configuration. A field that is None requests no value.
+
+    Returns:
+        Requested values, by field name: `exposure`, `gain`, `white_balance` or `focus`.
+    """
     values = {setting.field: getattr(config, setting.field) for setting in _SETTINGS}
     return {field: value for field, value in values.items() if value is not None}
 

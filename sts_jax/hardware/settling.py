@@ -17,7 +17,7 @@ Thumbnail = Float[np.ndarray, "24 32 3"]  # a small copy of an image, 0 to 255
 
 
 class NoContrastError(RuntimeError):
-    """The image is the same with and without the lights."""
+    """The image with the lights off differs from the image with the lights on by less than 2 of 255 on average."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,9 +135,10 @@ def settling(on: Sequence[Switch], off: Sequence[Switch], period_s: float) -> Se
 
     The `light_share` of a frame is 0 if the lights are off and 1 if they are on. A frame is settled if its
     `light_share` differs by at most 0.02 from the `light_share` of the last frame in the same `Switch`. The delay of a
-    frame is its time of arrival after the controller's acknowledgement. The settling time is the largest delay of a
-    frame that is not settled, plus one period of the camera. The period is added because a switch can occur at any time
-    within the exposure of a frame, and the measured switches occurred at only a few such times.
+    frame is its time of arrival after the controller's acknowledgement. A settling time is the largest delay of a frame
+    that is not settled, plus `period_s`. It is computed separately from the frames in `on` and from those in `off`.
+    `period_s` is added because a switch can occur at any time within the exposure of a frame, and the measured switches
+    occurred at only a few such times.
 
     Args:
         on: Switches from off to on. The scene must be at rest.

@@ -27,9 +27,10 @@ class NotStillError(TimeoutError):
 class Shot:
     """An image of the visual stream (lights off) or of the tactile stream (lights on).
 
-    The lights did not change between the times `before.acknowledged_s` and `until_s`. The frame arrived between these
-    times, at least one settling time after `before.acknowledged_s`. Frames that arrive during the settling time may
-    still show the previous levels of the lights.
+    The field `before` is the LED controller's answer to the last switch of the lights before the image. The answer
+    arrived at the time `before.acknowledged_s`. The lights did not change between this time and the time `until_s`. The
+    frame arrived between these two times, at least one settling time after `before.acknowledged_s`. Frames that arrive
+    during the settling time may still show the previous levels of the lights.
     """
 
     image: UInt8[np.ndarray, "height width 3"]  # RGB, raw and uncropped, read-only

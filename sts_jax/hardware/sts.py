@@ -1,4 +1,4 @@
-"""`STS`: camera and lights as one sensor. Each image is proven to be exposed in a single state of the lights."""
+"""`STS`: camera and lights as one sensor. It returns only images during whose exposure the lights did not change."""
 
 import dataclasses
 import itertools
@@ -184,12 +184,12 @@ class STS:
 
     @property
     def camera(self) -> Camera:
-        """The camera."""
+        """The `Camera` that takes the sensor's images."""
         return self._camera
 
     @property
     def leds(self) -> Leds:
-        """The LED controller.
+        """The open connection to the LED controller, which switches the sensor's lights.
 
         Raises:
             CameraNotConnectedError: The sensor is not connected.
@@ -283,8 +283,8 @@ class STS:
         """Take one image of the visual stream and one image of the tactile stream.
 
         Both frames arrive after the start of the call. The exposure of the first frame may begin up to one settling
-        time of the lights (`settling`) before this start. The first image belongs to the stream for which the lights
-        are already set, so the lights are switched only once for a pair.
+        time of the lights (`settling`) before the call. The first image belongs to the stream for which the lights are
+        already set, so the lights are switched only once for a pair.
 
         Args:
             timeout_ms: Longest wait for the pair (ms). None: two times the sensor's `timeout_s`. If the LED controller
@@ -295,7 +295,8 @@ class STS:
             The two images.
 
         Raises:
-            LightError: The time ended before one frame of each stream was proven to show the lights in the right state.
+            LightError: Within `timeout_ms`, no frame of one of the streams met the conditions that the description of
+                `STS` lists.
             LedError: The controller does not answer, or a lost controller was not found within `reconnect_s`.
             CameraError: The sensor is not connected, or the camera sends no usable frames. For the subclasses of
                 `CameraError`, see `Camera.read`.
@@ -504,8 +505,8 @@ def first_still(shots: Iterable[Shot], timeout_s: float, window_s: float) -> Sho
         window_s: Time during which the view must not change (s).
 
     Raises:
-        NotStillError: Within `timeout_s`, there was no period of `window_s` without movement, or there are no more
-            images.
+        NotStillError: Before the view was still for `window_s` seconds, the limit `timeout_s` was exceeded or `shots`
+            ended.
     """
     started_s: float | None = None
     first, look, change, allowed = None, None, 0.0, _STILL

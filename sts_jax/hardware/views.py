@@ -13,7 +13,7 @@ Progress = Callable[[int, int], None]  # called with the number of trajectories 
 
 
 class SensorView(NamedTuple):
-    """A rectified visual image and a rectified tactile image, for `visual` and `tactile` of a `Predictor`."""
+    """A rectified visual image and a rectified tactile image: the inputs `visual` and `tactile` of a `Predictor`."""
 
     visual: Float[np.ndarray, "height width 3"]  # visual image, RGB, float32 in [0, 1]
     tactile: Float[np.ndarray, "height width 3"]  # tactile image, RGB, float32 in [0, 1]
@@ -99,7 +99,9 @@ def recorded_images(
     *,
     progress: Progress | None = None,
 ) -> RecordedImages:
-    """Read and rectify the initial and final images of all confirmed trajectories.
+    """Read and rectify the initial and final images of all recorded trajectories that the user has confirmed.
+
+    The initial images show the held object. The final images show the object at rest.
 
     Args:
         recordings: Confirmed trajectories, from `load_recordings`.

@@ -33,9 +33,12 @@ from sts_jax.mvae.networks import MVAE, Config, Modality
 
 
 class Terms(NamedTuple):
-    """The loss of a batch, and its parts before they are multiplied by `beta` and `Modality.weight`.
+    """The loss of a batch, the divergence of the posterior from the prior, and the error of each modality.
 
-    Each part is a mean over combinations (sample, subset of the modalities). The mean excludes the combinations that
+    In the loss, the divergence is multiplied by `beta`, and each error by `Modality.weight`. The fields `kl` and
+    `reconstruction` do not contain these factors.
+
+    Both fields are means over combinations (sample, subset of the modalities). The means exclude the combinations that
     the loss ignores. For example, a combination is ignored if the sample has inputs, but none from the modalities of
     the subset.
     """

@@ -110,10 +110,10 @@ def corner_normals(
 ) -> Float[np.ndarray, "f 3 3"]:
     """Compute the unit normal at each corner of each face, so that shading is smooth except at sharp edges.
 
-    The normal at a corner is a weighted mean of the normals of the faces that meet at the vertex of the corner. The
-    mean includes a face if the angle between the normal of this face and the normal of the corner's own face is less
-    than `crease`. The weight of a face is the interior angle of this face at the vertex. A face without
-    area counts as a face with the normal (0, 0, 1) and the weight 0.
+    For a corner of the face F at the vertex v, the result is the normalised weighted mean of the normals of faces that
+    meet at v. A face is included if the angle between its normal and the normal of F is less than `crease`. The weight
+    of a face is its interior angle at v. A face without area counts as a face with the normal (0, 0, 1) and the
+    weight 0.
 
     Args:
         vertices: Vertices of the surface (m).

@@ -40,8 +40,8 @@ def decimate(path: Path, surface: Surface, target: int) -> Surface:
             break
     else:
         raise ValueError(
-            f"{path}: the mesh of {len(surface.faces):,} faces cannot be decimated to {target:,}, because it consists "
-            "of too many separate parts: allow more faces (argument faces)"
+            f"{path}: the mesh of {len(surface.faces):,} faces cannot be decimated to {target:,} faces, because it "
+            "consists of too many separate parts: allow more faces (argument faces)"
         )
     note = "" if surface.texture is None else ", and its texture replaced by one colour per corner of each face"
     warnings.warn(f"{path}: decimated from {len(surface.faces):,} to {len(faces):,} faces{note}", stacklevel=3)

@@ -36,7 +36,8 @@ def convex_hull(
     Args:
         points: Points that the hull encloses (m).
         limit: Largest number of vertices, at least 4. The default is 64.
-        tolerance: Largest distance of a point outside the hull (m), unless `limit` is reached. The default is 0.05 mm.
+        tolerance: Distance (m) by which points may lie outside the hull. If the hull has `limit` vertices, points may
+            lie farther outside. The default is 0.05 mm.
 
     Returns:
         Vertices of the hull. Each of them is one of the points.

@@ -29,7 +29,7 @@ class Item:
 
 @dataclasses.dataclass(frozen=True)
 class Library:
-    """The objects of a folder in a fixed order, and the skipped files with the reasons."""
+    """The mesh files of a folder in a fixed order, and the files that are not used, each with the reason."""
 
     folder: Path  # Folder of the mesh files.
     items: tuple[Item, ...]  # Objects, sorted by class and name.

@@ -88,7 +88,7 @@ def read_image(path: Path) -> Image.Image:
 
 
 class Resolver(trimesh.resolvers.FilePathResolver):
-    """Resolver of file names for trimesh. It also finds images in a second folder, the attribute `images`."""
+    """Reads the files to which a mesh file refers, for trimesh. It also looks for images in the folder `images`."""
 
     def __init__(self, path: Path, images: Path) -> None:
         super().__init__(str(path))

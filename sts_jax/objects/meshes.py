@@ -84,15 +84,16 @@ def load(
     """Load a mesh file as a body. All meshes of the file are merged into one.
 
     The mesh frame is the file's frame, rotated by `up` and `front`. Its origin is the centroid of the collision hull.
-    The collision hull is the convex hull of the mesh, reduced to at most 64 vertices. It represents the body in
-    collisions, unless `parts` is True. `hull_gap` measures how far the surface lies outside the collision hull.
-    Surfaces that are not closed are visible from both sides.
+    The collision hull is the convex hull of the mesh, reduced to at most 64 vertices. If `parts` is False, the
+    collision hull represents the body in collisions. `hull_gap` measures how far the surface lies outside the collision
+    hull. Surfaces that are not closed are visible from both sides.
 
     The albedo at a point of a face is the texture's value times the interpolated colour of the face's corners, in
     linear light. Textures, 8-bit colours and the diffuse colour `Kd` of an OBJ file are read as sRGB. Colour factors
-    and vertex colours of a glTF file are read as linear light (glTF specification). Alpha values are ignored, and so is
-    the `Kd` of an OBJ file with textures. Textures are resized to a square with a side of 1 pixel, 256 pixels or 1,024
-    pixels. Several textures are packed into one square. The repetitions of a texture within a face are then lost.
+    and vertex colours of a glTF file are read as linear light (glTF specification). Alpha values are ignored. The `Kd`
+    of an OBJ material that has a texture is ignored too. Textures are resized to a square with a side of 1 pixel, 256
+    pixels or 1,024 pixels. Several textures are packed into one square. The repetitions of a texture within a face are
+    then lost.
 
     Args:
         path: The mesh file. Its materials and images are looked up in the same folder.

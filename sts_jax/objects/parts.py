@@ -141,7 +141,8 @@ def surface_gaps(
 def hull_gap(body: Body) -> float:
     """Compute the largest distance (m) by which a vertex of a body's surface lies outside the body's collision parts.
 
-    For a single part, no other point of the surface lies farther outside. For several parts, use `gaps`.
+    If the body has one part, no point of the surface lies farther outside than the result. If the body has several
+    parts, points between the vertices can lie farther outside. Use `gaps` for such a body.
     """
     surface = np.unique(np.asarray(body.vertices, float), axis=0)
     parts = [outside_hull(surface, np.unique(part, axis=0)) for part in np.asarray(body.hulls, float)]

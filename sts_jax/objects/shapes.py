@@ -71,7 +71,7 @@ def rectangle(width: Number, depth: Number, chamfer: Number = 0.0) -> np.ndarray
 
 
 def rings(outline: np.ndarray, levels: Sequence[tuple[Number, Number]]) -> np.ndarray:
-    """Return a horizontal ring for each of k levels, as an array (k, n, 3) (mm).
+    """Return k rings, (k, n, 3) (mm). Each ring is a scaled copy of the outline in a horizontal plane.
 
     Args:
         outline: Outline of n points, (n, 2) (mm).
@@ -81,7 +81,7 @@ def rings(outline: np.ndarray, levels: Sequence[tuple[Number, Number]]) -> np.nd
 
 
 def sweep(path: np.ndarray, section: np.ndarray, binormal: Sequence[Number], *, closed: bool = False) -> np.ndarray:
-    """Return rings that follow a path, such as the rings of a tube or a handle.
+    """Return copies of an outline along a path, as rings for `loft`. They can form a tube or a handle.
 
     Args:
         path: Points along the path, (k, 3) (mm).
@@ -247,7 +247,7 @@ def move(part: Part, shift: Sequence[Number] = (0, 0, 0), *, axis: str = "z", sp
 
 
 def mirrored(part: Part, axis: int = 0) -> Part:
-    """Return the mirror image of a part, in which the coordinate `axis` (0, 1 or 2) changes its sign."""
+    """Mirror a part: change the sign of the coordinate `axis` (0, 1 or 2) of every vertex."""
     flip = np.ones(3)
     flip[axis] = -1
     return part._replace(vertices=part.vertices * flip, faces=part.faces[:, ::-1])

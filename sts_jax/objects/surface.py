@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 
 
 class Surface(NamedTuple):
-    """A triangulated surface.
+    """Triangles of a mesh, with a colour and texture coordinates at each corner of each triangle.
 
     The albedo at a point of a face is the texture's value times the colour, in linear light. The colour is interpolated
     between the three corners of the face.
@@ -72,10 +72,10 @@ def proper(path: Path, surface: Surface) -> Surface:
 def is_closed(faces: np.ndarray) -> bool:
     """Return whether triangular faces form a closed surface.
 
-    The vertex order of a face gives a direction to each edge of the face. A surface counts as closed if, at every edge,
-    the two directions occur equally often. A surface of a single part then has no holes, and all of its faces have the
-    same orientation. Closed parts that touch and share vertices also count as closed, although more than two faces can
-    meet at an edge.
+    The face (a, b, c) has the directed edges a to b, b to c and c to a. A surface counts as closed if its faces have
+    the edge a to b as often as the edge b to a, for all vertices a and b. A surface of a single part then has no holes,
+    and all of its faces have the same orientation. Closed parts that touch and share vertices also count as closed,
+    although more than two faces can meet at an edge.
 
     Args:
         faces: Vertex indices of each face, int (f, 3).

@@ -1,4 +1,4 @@
-"""Visual stream: the camera, the rasteriser, shading of the view through the skin, and views from outside."""
+"""Images of the view through the skin (visual stream): camera, rasteriser and shading. Also views from outside."""
 
 from sts_jax.optics.camera import Camera, full_window, object_window, rays, to_pixels
 from sts_jax.optics.external_view import photograph

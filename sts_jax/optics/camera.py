@@ -60,10 +60,10 @@ def object_window(
     Source: the supplement of Rezaei-Shoshtari et al. 2021, "Training Details".
 
     A window is the rectangle on the gel's outer face that an image shows. The full window (`full_window`) is the
-    largest window with the aspect ratio of the image. The points are projected to the gel's outer face. If their
-    bounding box does not overlap the full window, the result is the full window. Otherwise, the box is clipped to the
-    full window. The result is then the smallest window that contains the clipped box, has the aspect ratio of the image
-    and lies within the full window.
+    largest centred window in the camera's view that has the aspect ratio of the image. The points are projected to the
+    gel's outer face. If their bounding box does not overlap the full window, the result is the full window. Otherwise,
+    the box is clipped to the full window. The result is then the smallest window that contains the clipped box, has the
+    aspect ratio of the image, lies within the full window and has a shorter side of at least `smallest`.
 
     Args:
         camera: The camera.

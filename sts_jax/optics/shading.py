@@ -220,7 +220,7 @@ def housing(
 def empty_view(
     room: Room, square_radius: Float[Array, "*n"], walls: Float[Array, "*n"], hidden: Float[Array, "*n"]
 ) -> Float[Array, "*n 3"]:
-    """Render the background of the visual image: the empty pad, the walls below it, and the object's shadow on the pad.
+    """Render the visual image without the object: the pad with the object's shadow, and the housing's walls beside it.
 
     Args:
         room: Constants of the external light.

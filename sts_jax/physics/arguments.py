@@ -55,7 +55,10 @@ def _is_frozen(scenario: Any) -> bool:
 
 
 def check_condition(scenario: Scenario, start: Start) -> None:
-    """Raise a ValueError unless `start.condition` has as many numbers as `scenario.quantities` declares."""
+    """Raise a ValueError unless `start.condition` has as many numbers as `scenario.quantities` declares.
+
+    The condition of a trajectory consists of known quantities, such as the acceleration of the pad.
+    """
     width, declared = start.condition.shape[-1], len(scenario.condition_scale)
     if width != declared:
         raise ValueError(
@@ -79,7 +82,8 @@ def check_start(start: Start, scenario: Scenario, count: int) -> Start:
     """Check the starts that a caller passes to `simulate`, and return them as JAX arrays of n starts.
 
     Args:
-        start: Starts of n trajectories: `pose` (n, 7), `condition` (n, c), and `held` and `carried` (n,) or one number.
+        start: Starts of n trajectories. `Start` explains the fields. `pose` has the shape (n, 7), and `condition` has
+            the shape (n, c). `held` and `carried` have the shape (n,) or are one number for all trajectories.
         scenario: Scenario, whose `quantities` define c.
         count: Number n of trajectories.
 
@@ -122,7 +126,8 @@ def check_hidden(hidden: Hidden, count: int) -> Hidden:
     """Check the hidden properties that a caller passes to `simulate`, and return them as JAX arrays.
 
     Args:
-        hidden: Hidden properties of n trajectories. Its field `up` has the shape (n, 3), the other fields (n,).
+        hidden: Friction, mass of the shell, and contents, for each of n trajectories. The field `up` has the shape
+            (n, 3), and the other fields have the shape (n,).
         count: Number n of trajectories.
 
     Raises:

@@ -84,7 +84,7 @@ def _refusal(faces: StableFaces, scenario: Scenario) -> str | None:
     if not len(faces.up):
         return "it rests on no face, because its centre of mass is not above the inside of any face"
     if scenario.must_stand and faces.up[:, 2].max() < math.cos(UPRIGHT):
-        return f"it does not stand upright (+z up), as {type(scenario).__name__} needs"
+        return f"it does not stand upright (+z up), but {type(scenario).__name__} needs an upright body"
     return None
 
 

@@ -5,8 +5,8 @@ the box. The edges of a small object on a large pad then have contacts with the 
 push the object. The object then never comes to rest, or is thrown off. MJX would also compile its test again for every
 mesh.
 
-The pad and the stop wall of the slope are boxes whose sides are parallel to the axes. The contacts of a convex hull
-with such a box can be of four kinds. This module computes three of these kinds:
+The pad and the stop wall (as in `Inclined`) are boxes whose sides are parallel to the axes. The contacts of a convex
+hull with such a box can be of four kinds. This module computes three of these kinds:
 
 - A vertex of the hull lies inside the box. The vertex is pushed out through the nearest of the top and the four sides.
 - An edge of the hull crosses a rim of the top. The edge is pushed along the common normal of edge and rim.
@@ -48,9 +48,10 @@ class Hull(NamedTuple):
 
 
 class Contacts(NamedTuple):
-    """k contact points. The fields have the same meaning as in MuJoCo's `mjContact`.
+    """k contact points of an object with the pad or the stop wall. The fields mean the same as in MuJoCo's `mjContact`.
 
-    `collide` returns the points in the frame of the box's top. `scene.step` needs the points in the sensor frame.
+    The pad and the stop wall are boxes. `collide` returns the contacts with one box. Its points are relative to the
+    centre of the box's top. `scene.step` needs the points in the sensor frame.
     """
 
     dist: Float[Array, "k"]  # m, negative for penetration, 1 where there is no contact

@@ -41,7 +41,7 @@ def draw(
     scenario: Scenario,
     pad: tuple[float, float],
 ) -> tuple[Start, Hidden]:
-    """Draw a `Start` and the hidden properties of each of n trajectories.
+    """Draw a `Start` and the hidden properties (friction, mass of the shell, contents) of each of n trajectories.
 
     The draw with index i depends on `key`, on `body[i]`, `nth[i]` and `attempt[i]`, and on the geometry of the body
     `body[i]`. The draw does not depend on the other draws.

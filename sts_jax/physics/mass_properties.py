@@ -1,4 +1,4 @@
-"""Mass properties of bodies, given the hidden properties of each draw."""
+"""Mass, centre of mass, inertia and friction of bodies, computed from hidden properties, such as the contents."""
 
 import concurrent.futures
 import os

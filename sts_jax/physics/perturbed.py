@@ -29,7 +29,10 @@ from sts_jax.physics.scene import Contact
 
 
 class Jerk(NamedTuple):
-    """The condition of `Perturbed`: a short, constant acceleration of the pad, which begins at frame 0."""
+    """Acceleration of the pad in the scenario `Perturbed`, and the duration of this acceleration.
+
+    The acceleration is constant. It begins at frame 0.
+    """
 
     acceleration: Float[Array | np.ndarray, "*n 2"]  # acceleration of the pad along x and y (m/s^2)
     duration: Float[Array | np.ndarray, "*n"]  # duration of the acceleration (s)

@@ -151,9 +151,10 @@ class Released(Scenario):
         - `TOPPLES`, if it has turned by more than 45 degrees (turns about the vertical do not count),
         - `RETURNS`, in all other cases.
 
-        `start` places an object on an edge between two of its faces, usually with the narrower face at less than 45
-        degrees to the pad. If the two faces meet at a right angle, the wider face is then at more than 45 degrees to
-        the pad. In this usual case, an object that turns by less than 45 degrees comes to rest on the narrower face.
+        The limit of 45 degrees suits most poses from `start`. In these poses, the object touches the pad with the edge
+        between two of its faces, and the narrower face is at less than 45 degrees to the pad. If the two faces are
+        perpendicular, the object turns by less than 45 degrees until it rests on the narrower face, or by more than 45
+        degrees until it rests on the wider face.
         """
         before, after = (geometry.quat_to_matrix(geometry.normalize(pose[3:]))[2] for pose in (first, last))
         stays = jnp.where(before @ after < math.cos(TURNED), Outcome.TOPPLES, Outcome.RETURNS)

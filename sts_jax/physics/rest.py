@@ -178,8 +178,9 @@ def place(
     half = np.asarray(sensor.gel.size) / 2
     if not (np.abs(com) < half).all():
         raise ValueError(
-            f"position is {position} m, so the centre of mass lies at ({com[0]:.3f}, {com[1]:.3f}) m, beyond the pad, "
-            f"and the body would fall off: |x| of the centre of mass must be < {half[0]:g} m and |y| < {half[1]:g} m"
+            f"position is {position} m, but the body would fall off, because its centre of mass would lie beyond the "
+            f"pad, at ({com[0]:.3f}, {com[1]:.3f}) m: give a position nearer to (0, 0), so that the centre of mass has "
+            f"|x| < {half[0]:g} m and |y| < {half[1]:g} m"
         )
     return Placement(pose, wrench)
 

@@ -24,7 +24,10 @@ STANDING = 1.04e-5  # m, depth in the pad of an object that stands or lies at re
 
 
 class Outcome(enum.IntEnum):
-    """The outcome of a trajectory. Each scenario uses some of the members. `str` returns words such as "fell off"."""
+    """The result of the motion in a trajectory, such as `TOPPLES` or `FELL_OFF`.
+
+    Each scenario uses some of the members. `str` returns words such as "fell off".
+    """
 
     RESTS = 0
     FELL_OFF = 1
@@ -224,7 +227,7 @@ class Scenario(abc.ABC):
 
     @property
     def stays(self) -> tuple[enum.IntEnum, ...]:
-        """The outcomes of objects that stay on the pad."""
+        """All members of `outcomes` except `Outcome.FELL_OFF`: the outcomes of objects that stay on the pad."""
         return tuple(outcome for outcome in self.outcomes if outcome != Outcome.FELL_OFF)
 
     def named(self, number: int) -> str:

@@ -218,9 +218,14 @@ def template(
 
 
 def drawn(model: mujoco.MjModel, like: mjx.Model) -> dict[str, np.ndarray]:
-    """Return the values that a model has in the fields that `set_rigid` changes.
+    """Read the fields that `set_rigid` changes from a model of C MuJoCo.
 
-    The keys are the names of the fields in `mjx.Model`. The arrays have the dtypes of the fields of `like`.
+    Args:
+        model: Model of C MuJoCo.
+        like: Model of MJX. The returned arrays have the dtypes of its fields.
+
+    Returns:
+        Arrays by the name of the field in `mjx.Model`.
     """
     fields = {name: np.array(getattr(model, name), getattr(like, name).dtype) for name in DRAWN}
     return fields | {"stat.meaninertia": np.array(model.stat.meaninertia, np.float32)}

@@ -29,8 +29,8 @@ def lit_skin(
             from the pinhole along the camera's axis.
 
     Returns:
-        Red, green and blue channel, not clipped to [0, 1]. The outermost rays of the grid are missing
-        (h = a - 2, w = b - 2). They are only used to compute the normals at the neighbouring rays.
+        Red, green and blue channel, not clipped to [0, 1]. Each channel has two rows and two columns less than
+        `imprint`, because the outermost rays are only used to compute the normals at the neighbouring rays.
     """
     coupled = sensor.skin.coupling > 0
     imprint = jax.lax.cond(coupled, tactile.couple, lambda *given: given[0], imprint, sensor.skin.coupling, pitch)

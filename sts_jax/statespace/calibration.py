@@ -46,7 +46,7 @@ class Calibration(NamedTuple):
 
 
 def of_items(config: Config, calibration: Calibration, present: dict[str, Bool[Array, "n"]]) -> Calibration:
-    """Select the numbers of a calibration that belong to the inputs of each item.
+    """Select the numbers of a calibration for each item, according to the inputs that the item has.
 
     Args:
         config: Configuration of the model.
@@ -82,8 +82,8 @@ def predict(
         empty: `visual` and `tactile` image of the empty sensor, in [0, 1].
         condition: Known quantities of the scenario such as an acceleration, `(n, c)`, from
             `training.Preprocessing.encode_condition`. None if the model has no condition.
-        calibration: Calibration of the density, or None. Items that have the true state code `state` as an input are
-            not corrected.
+        calibration: Numbers that correct the density. With None, no density is corrected. The density of an item that
+            has the true state code `state` as an input is never corrected.
 
     Returns:
         The posterior in the first frame, `(n, code + look)`, and the density of the final pose. The posterior is a

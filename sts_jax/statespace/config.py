@@ -74,9 +74,9 @@ class Config:
             )
         if self.condition < 0 or (self.condition and not 0 <= 2 * self.vectors <= self.condition):
             raise ValueError(
-                f"condition is {self.condition} and vectors is {self.vectors}, but condition (the number of values in "
-                "a scenario's condition) must be 0, or at least 2 * vectors with vectors >= 0, because a vector has "
-                "two of the values"
+                f"condition is {self.condition} and vectors is {self.vectors}, but they must satisfy condition >= "
+                "2 * vectors >= 0, because `condition` is a number of values, and the first 2 * vectors of these "
+                "values are vectors (x, y). If the scenario has no condition, set condition to 0"
             )
         if self.traits < TINT:
             raise ValueError(

@@ -1,4 +1,4 @@
-"""Fit of the calibration of a model to trajectories that the training did not see."""
+"""Fit of the numbers that correct a model's predictions (`Calibration`), to trajectories outside the training set."""
 
 import functools
 import itertools
@@ -49,11 +49,12 @@ def fit(
 ) -> Calibration:
     """Fit the calibration of a model to trajectories that its training did not see.
 
-    The calibration has four values for each subset of the inputs. The first three maximise the likelihood of the true
-    outcomes and final poses, multiplied by a prior that favours values near 1. The fourth value is the contrast, which
-    is the sharpness of the outlines in sampled images. `fit` chooses the value in `CONTRASTS` at which the gradient
-    energy of the sampled images is nearest to that of the true images. The gradient energy of an image is the sum of
-    the squared differences of neighbouring pixels.
+    The calibration has four values for each subset of the inputs. The first three values correct the predicted density
+    of the final pose. `fit` chooses the values that maximise the likelihood of the true outcomes and final poses,
+    multiplied by a prior that favours values near 1. The fourth value is the contrast, which is the sharpness of the
+    outlines in sampled images. `fit` chooses the value in `CONTRASTS` at which the gradient energy of the sampled
+    images is nearest to that of the true images. The gradient energy of an image is the sum of the squared differences
+    of neighbouring pixels.
 
     Args:
         graphdef: Definition of the model, from `init`.

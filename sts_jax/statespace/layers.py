@@ -1,4 +1,4 @@
-"""The images of rendered objects as layers over the images of the empty sensor, and their combination (`compose`)."""
+"""Rendered images of objects (`Layers`), and `compose`, which combines them with the images of the empty sensor."""
 
 from typing import NamedTuple
 

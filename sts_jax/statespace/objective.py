@@ -82,7 +82,9 @@ def experts(
 
 
 def fuse(found: dict[str, Gaussian], counts: dict[str, Bool[Array, "n"]]) -> Gaussian:
-    """Combine the estimates from all inputs of each item: multiply the standard normal prior by the Gaussians.
+    """Combine the estimates from all inputs of each item into one Gaussian, which is called the belief.
+
+    The belief is the normalised product of the standard normal prior and the estimates from the item's inputs.
 
     Args:
         found: Result of `experts`, a dictionary from the name of each input to the Gaussian estimate from this input.

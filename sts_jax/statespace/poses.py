@@ -62,9 +62,10 @@ def certainty(code: Float[Array, "*n 12"]) -> Float[Array, "*n"]:
 
 
 def matrix(code: Float[Array, "*n 12"]) -> Float[Array, "*n 3 3"]:
-    """Return the 3x3 matrix in each pose code, which has the position and the rotation matrix of an object.
+    """Return the 3x3 matrix in each pose code (position and rotation matrix).
 
-    In the mean of several pose codes, it is the mean of their rotation matrices, which is not a rotation in general.
+    If a code is the mean of several pose codes, the returned matrix is the mean of several rotation matrices. Such a
+    mean is in general not a rotation matrix.
     """
     return code[..., 3:].reshape(*code.shape[:-1], 3, 3)
 

@@ -1,4 +1,8 @@
-"""Images of the lit skin (tactile stream): equilibrium of the gel, shape of the skin, lights, shadows, reflectance."""
+"""Tactile image: equilibrium of an object on the gel, shape of the skin, lights, shadows and reflectance.
+
+The skin is the paint on the gel's outer face. The tactile image shows the inner side of the skin while the internal
+lights are on.
+"""
 
 from sts_jax.tactile.gel import Equilibrium, Gel, cell_area, cell_centres, indent, settle
 from sts_jax.tactile.normals import surface_normals

@@ -56,7 +56,7 @@ class Gel:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Equilibrium:
-    """Equilibrium of a rigid object on the gel.
+    """Equilibrium of a rigid object on the gel: the motion of the object and the pressure on the gel.
 
     The object moves from its given pose to the equilibrium. `sink` and `turn` describe this motion.
     """

@@ -1,4 +1,8 @@
-"""Image of the lit skin: smoothing of the imprint, directional and point lights, shadows, Phong reflectance, darkening.
+"""Tactile image from the imprint of an object: smoothing, directional and point lights, shadows, Phong reflectance.
+
+The skin is the paint on the gel's outer face. The tactile image shows the inner side of the skin while the internal
+lights are on. An imprint is the depth of the skin below the gel's undeformed face (m). The deeper the skin is pressed,
+the darker it is in the image (`darken`).
 
 Images are float32, (height, width, 3), and not clipped to [0, 1]. `sense` clips them as its last step.
 """
@@ -219,9 +223,9 @@ def phong(
         I = k_a i_a + sum_m (k_d (L_m . N) + k_s (R_m . V)^alpha) i_m,   R_m = 2 (L_m . N) N - L_m
 
     k_a, i_a, k_d, k_s and alpha are the fields `ambient`, `ambient_color`, `diffuse`, `specular` and `shininess` of
-    `Phong`. N is the normal, L_m the unit vector to light m, and i_m the colour of light m. Both scalar products are
-    clipped at 0. V is the unit vector to the viewer. It is (0, 0, -1) at all points, as for a distant viewer, so that
-    flat skin under far lights is uniform.
+    `Phong`. N is the normal, L_m the unit vector to light m, and i_m the colour of light m. In the formula for I,
+    negative values of (L_m . N) and (R_m . V) count as 0. V is the unit vector to the viewer. It is (0, 0, -1) at all
+    points, as for a distant viewer, so that flat skin under far lights is uniform.
 
     For a near light at the position p_m, the colour is multiplied by `(reference / |p_m - x|)^falloff` at the point x.
     `reference` and `falloff` are fields of `Leds`. Distances below 0.1 mm count as 0.1 mm.

@@ -18,7 +18,8 @@ def save_blank(folder: Path, visual: np.ndarray, tactile: np.ndarray) -> None:
         tactile: Tactile image, uint8 `(height, width, 3)`.
 
     Raises:
-        OSError: The file cannot be written, or the manifest of the model is damaged.
+        OSError: The file cannot be written, or `manifest.json`, which has the checksums of the model's files, is
+            damaged.
     """
     path = folder / "blank.npz"
     new = not path.exists()
@@ -40,6 +41,7 @@ def load_blank(folder: Path) -> tuple[np.ndarray, np.ndarray]:
 
     Raises:
         FileNotFoundError: The file is missing.
+        OSError: The file cannot be read, for example because the permission is missing.
         DamagedFileError: The file is damaged.
     """
     path = folder / "blank.npz"
@@ -47,8 +49,9 @@ def load_blank(folder: Path) -> tuple[np.ndarray, np.ndarray]:
         raise FileNotFoundError(
             f"{path} is missing: start the training again, or write the file with training.save_blank."
         )
+    content = path.read_bytes()
     try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as arrays:
+        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
             images = arrays["visual"], arrays["tactile"]
         if any(image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 for image in images):
             found = ", ".join(f"{image.dtype} {image.shape}" for image in images)

@@ -1,4 +1,4 @@
-"""Calibrate a trained state-space model on trajectories that its training did not see."""
+"""Fit the numbers that correct the predictions of a trained state-space model, on trajectories of new objects."""
 
 import os
 from pathlib import Path

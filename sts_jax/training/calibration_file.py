@@ -1,7 +1,8 @@
 """Read and write `calibration.json`, the calibration of a state-space model in the model's folder.
 
-The file contains a checksum of its content, and a checksum of the model's other files at the time of the fit. It is
-written as a whole after the training, so that an interruption leaves the model unchanged.
+A calibration has the numbers that correct the predicted density of the final pose, see `statespace.Calibration`. The
+file also has a checksum of its own content, and a checksum of the model's other files at the time of the fit. The file
+is written as a whole after the training, so that an interruption leaves the model unchanged.
 """
 
 from pathlib import Path
@@ -22,7 +23,7 @@ def write(folder: Path, calibration: statespace.Calibration, inputs: tuple[str, 
 
     Args:
         folder: Folder of the model.
-        calibration: Calibration, from `statespace.fit_calibration`.
+        calibration: Numbers that correct the model's predictions, from `statespace.fit_calibration`.
         inputs: Inputs of the model, `Config.inputs`.
         data: Checksum of the validation data to which the calibration was fitted, from `Arrays.checksum`. None if it is
             unknown.

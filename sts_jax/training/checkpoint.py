@@ -5,13 +5,15 @@ The folder of a model contains
 - `config.json`: the model, the options of the training and the preprocessing
 - `metrics.jsonl`: the training log
 - `checkpoints/STEP/`: the current checkpoint
-- `manifest.json`: the name of the current checkpoint and the checksums of its files (`sts_jax.training.manifest`)
+- `manifest.json`: the step of the current checkpoint and the checksums of the model's files
+  (`sts_jax.training.manifest`)
 
 If the process is killed while it writes a checkpoint, the previous checkpoint stays the current one.
 
 A checkpoint has two parts, `weights` and `optimiser`. A prediction reads only the weights, so that a model stays
-readable with another optimiser or another version of optax. Orbax writes both parts. The weights may instead be one
-small file (`sts_jax.training.rounded`). Checkpoints of sts_jax 0.1 are not divided into parts, and can still be read.
+readable with another optimiser or another version of optax. Orbax writes both parts. `save(..., compact=True)`
+instead writes one small file with rounded weights (`sts_jax.training.rounded`). Checkpoints of sts_jax 0.1 are not
+divided into parts, and can still be read.
 """
 
 import contextlib

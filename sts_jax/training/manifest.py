@@ -97,8 +97,8 @@ def verify(folder: Path, manifest: Manifest) -> None:
     for name in _there(folder, manifest.step):
         if name not in manifest.files:
             raise storage.DamagedFileError(
-                f"{folder / name} is not listed in {NAME}: the file does not belong to this model. Move it elsewhere, "
-                f"or {remedy}."
+                f"{folder / name} is not listed in {NAME}: the file does not belong to this model. Move the file "
+                f"elsewhere, restore {NAME} from a copy, or delete {folder} and train again."
             )
     for name, digest in manifest.files.items():
         path = folder / name
@@ -109,7 +109,7 @@ def verify(folder: Path, manifest: Manifest) -> None:
         except (OSError, ValueError) as error:  # ValueError: a damaged manifest may list a name with a null byte
             raise storage.DamagedFileError(f"{path} cannot be read ({error}): {remedy}.") from error
         if found != digest:
-            again = " or delete this file and start the training again" if name == "blank.npz" else ""
+            again = ", or delete this file and start the training again" if name == "blank.npz" else ""
             raise storage.DamagedFileError(
                 f"{path} is not the file that {NAME} lists: its SHA-256 differs. The file was edited, exchanged or "
                 f"damaged: {remedy}{again}."

@@ -1,4 +1,4 @@
-"""The default optimiser."""
+"""The default optimiser of a training: Adam with a learning rate schedule and gradient clipping."""
 
 from typing import Any
 

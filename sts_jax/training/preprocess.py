@@ -1,4 +1,7 @@
-"""The preprocessing of measurements for the networks, which is stored with every model."""
+"""Preprocessing of images, poses and conditions for the networks, and a test for a contact in tactile images.
+
+The `config.json` of a trained model contains the values of the fields of its `Preprocessing`.
+"""
 
 import dataclasses
 import json
@@ -113,7 +116,7 @@ class Preprocessing:
 
         Args:
             name: Name of the modality.
-            values: Poses, images in [0, 1], or the numbers of a further modality (SI units).
+            values: Poses, images in [0, 1], or the numbers of a further modality from `dataset.Measurement` (SI units).
 
         Returns:
             The result of `encode_pose` for the modality `pose`. The numbers of a further modality are divided by its
@@ -175,8 +178,8 @@ def touch_of_noisy_images(
     The estimate of the standard deviation uses the differences between the block means of the images and of the blank
     image. The median is subtracted from the differences of each channel of an image, so a uniform change of the light
     has no effect. The estimate is 1.4826 times the median magnitude of the differences after this subtraction. Contacts
-    on less than half of the pad hardly change the estimate. An uneven change of the light since the blank image
-    increases the estimate.
+    on less than half of the pad hardly change the estimate. If the light has changed unevenly since the blank image
+    was taken, the estimate is larger.
 
     Args:
         preprocessing: Preprocessing whose fields are kept, except the four fields of the contact test.

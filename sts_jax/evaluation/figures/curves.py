@@ -32,8 +32,9 @@ def scaling(path: Path, points: Sequence[Trained], *, ceiling: float | None = No
     The skill is a score of the predicted images. Perfect images have the skill 1, and the mean training image has the
     skill 0 (see `metrics.skill`).
 
-    In the left panel, a line connects models with the same name and number of gradient steps. In the right panel, a
-    line connects models with the same name and number of training trajectories.
+    The x axis of the left panel is the number of training trajectories. A line there connects models with the same name
+    and number of gradient steps. The x axis of the right panel is the training time. A line there connects models with
+    the same name and number of training trajectories.
 
     Args:
         path: The PNG file to write.

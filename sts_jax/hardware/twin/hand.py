@@ -1,4 +1,4 @@
-"""`Hand`: a program that moves the twin's object in place of a person while trajectories are collected."""
+"""`Hand`: a program that replaces the person during the collection of trajectories, and moves the simulated object."""
 
 from sts_jax.hardware.collecting import Action, AutomaticPerson, View
 from sts_jax.hardware.guide import Stage
@@ -11,7 +11,7 @@ _UNMOVED_S = 3.0  # time without motion after a release after which the object c
 
 
 class Hand(AutomaticPerson):
-    """A program that takes the place of the person in `hardware.collect`, and moves the object of a twin.
+    """A program that replaces the person in `hardware.collect`, and moves the object on a `Twin` (a simulated sensor).
 
     `hardware.collect` shows its instructions as a `View`. The hand sends the matching commands to the twin, and
     confirms every trajectory. If an object does not move after its release, the hand confirms the release, as a person

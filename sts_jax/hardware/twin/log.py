@@ -1,4 +1,4 @@
-"""The twin's log: the ground truth of each frame."""
+"""The log of a `Twin` (a simulated sensor): a file with the ground truth of each camera frame."""
 
 import contextlib
 import dataclasses
@@ -11,7 +11,7 @@ from typing import Any, BinaryIO, TextIO
 
 @dataclasses.dataclass(frozen=True)
 class Exposure:
-    """The ground truth of one frame.
+    """The ground truth of one frame of a `Twin` (a simulated sensor): times, light, pose of the object and fault.
 
     All times are on the twin's clock. If the twin runs in a server (class `Served`), this clock is `time.monotonic`. If
     the fault `repeat` delivers an earlier frame again, `index`, `due_s` and `fault` belong to the new delivery. All
@@ -71,7 +71,9 @@ class Log:
 
 
 def read_log(path: str | os.PathLike) -> list[Exposure]:
-    """Read the log of a twin. The twin may still be writing it: an incomplete last line is ignored.
+    """Read the log file of a `Twin` (a simulated sensor).
+
+    The twin may still be writing the file. An incomplete last line is ignored.
 
     Args:
         path: Path that `Twin` received as its argument `log`.

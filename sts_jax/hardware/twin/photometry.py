@@ -18,7 +18,10 @@ _STRIP = 1 << 18  # number of values that are processed at once, so that they st
 
 @dataclasses.dataclass(frozen=True)
 class Imperfections:
-    """Deviations of the twin's camera and lights from ideal ones. The defaults are our choice, not measured."""
+    """Deviations of a simulated camera and simulated lights from ideal ones, such as noise and delays.
+
+    The default values are assumed, not measured.
+    """
 
     exposure_s: float = 0.012  # time during which the camera integrates the light of one frame (s)
     # time from the end of the exposure to the delivery of the frame (s). We assume 0.015 to 0.12 s for real cameras

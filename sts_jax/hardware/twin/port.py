@@ -1,4 +1,4 @@
-"""A pseudo-terminal that acts as the serial port of the twin's LED controller."""
+"""A pseudo-terminal that acts as the serial port of the LED controller of a `Twin` (a simulated sensor)."""
 
 import contextlib
 import os
@@ -17,7 +17,9 @@ _SPEED = termios.B115200  # baud rate of the protocol
 
 
 class LedPort:
-    """The serial port of the twin's LED controller: a pseudo-terminal that answers requests in its own thread.
+    """The serial port of the LED controller of a `Twin` (a simulated sensor).
+
+    The port is a pseudo-terminal. A thread answers the requests of the host, which is the program that opens the port.
 
     The host must open the port at 115200 baud. As on a real serial line, a host at another rate receives
     unreadable bytes, and its requests are not executed.

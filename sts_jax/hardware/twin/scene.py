@@ -1,4 +1,4 @@
-"""The scene in front of the twin's camera: an empty pad, or an object that is held, moves and lies still."""
+"""The scene of a `Twin` (a simulated sensor): an empty pad, or an object that is held, moves and lies still."""
 
 import abc
 import bisect
@@ -46,7 +46,7 @@ class Seen(NamedTuple):
 
 
 class Scene(abc.ABC):
-    """Base class of the scenes in front of the twin's camera.
+    """Base class of the scenes in front of the camera of a `Twin` (a simulated sensor).
 
     A subclass defines two methods. `at` returns the state of the scene at a given time. `ends` returns two images of
     the scene in a given state: one with the LEDs off, and one with the LEDs at full power. A scene that takes commands
@@ -178,13 +178,14 @@ class _Motion(NamedTuple):
 
 
 class ObjectScene(Scene):
-    """A scene with one object, which is held on the pad and released as often as commands require.
+    """A scene with one object. Commands place the object on the pad, release it and take it away.
 
-    The pad is empty at first. The command `hold` places the object in the first pose of the next simulated trajectory,
-    `release` lets it go, and `clear` takes it away. After the release, the object follows the trajectory. The scene
-    shows `motion_rate` poses per second until the object is at rest, and the last pose from then on.
+    The motion of the object is simulated in advance: `physics.simulate` computes trajectories of a scenario, such as
+    `physics.Released`. Trajectories that end before the object has come to rest are skipped.
 
-    Simulated trajectories that end before the object has come to rest are skipped.
+    The pad is empty at first. The command `hold` places the object in the first pose of the next trajectory, `release`
+    lets it go, and `clear` takes it away. After the release, the object follows the trajectory. The scene shows
+    `motion_rate` poses per second until the object is at rest, and the last pose from then on.
     """
 
     def __init__(
@@ -362,7 +363,7 @@ class ObjectScene(Scene):
                 attempts = 0 if found else attempts + 1
                 if attempts == _ATTEMPTS:
                     raise ValueError(
-                        f"the object comes to rest in none of {_ATTEMPTS * _BATCH} simulated trajectories of "
+                        f"the object did not come to rest in any of {_ATTEMPTS * _BATCH} simulated trajectories of "
                         f"{self._scenario.frames} frames each: give the scenario more frames (scenario.frames)"
                     )
                 self._motions += found

@@ -1,4 +1,4 @@
-"""`Served` runs a twin on the real clock, and offers its serial port and camera stream to other processes."""
+"""`Served`: a server for a `Twin` (a simulated sensor), whose serial port and camera other processes can open."""
 
 import ipaddress
 import os
@@ -15,7 +15,7 @@ _OPERATE_S = 0.05  # period with which `release_every` is checked (s)
 
 
 class Served:
-    """A running server through which other processes use a twin as if it were a real sensor.
+    """A running server through which other processes use a `Twin` (a simulated sensor) like a real sensor.
 
     ```python
     body = sts_jax.objects.make(jax.random.key(0), "bottle")

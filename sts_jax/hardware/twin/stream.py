@@ -1,4 +1,7 @@
-"""The HTTP server of a twin, which sends the camera stream (motion JPEG) and the twin's state, and takes commands."""
+"""The HTTP server of a `Twin` (a simulated sensor).
+
+The server sends the camera stream (motion JPEG) and the state of the twin, and takes commands.
+"""
 
 import contextlib
 import dataclasses
@@ -24,7 +27,10 @@ _KEPT = 32  # largest number of frames that wait for their delivery
 
 
 class CameraThread:
-    """A thread that produces frames at the camera's rate while at least one client is connected."""
+    """A thread that produces the frames of a `Twin` (a simulated sensor) while at least one client is connected.
+
+    The frame rate is `Twin.rate`.
+    """
 
     def __init__(self, twin: Twin):
         """Start the thread."""
@@ -103,7 +109,7 @@ class CameraThread:
 
 
 class WebServer(http.server.ThreadingHTTPServer):
-    """The HTTP server of a twin.
+    """The HTTP server of a `Twin` (a simulated sensor).
 
     The server sends the camera stream and the twin's state. A client can send a command, or request a simulated fault.
     """

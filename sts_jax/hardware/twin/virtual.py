@@ -1,4 +1,4 @@
-"""`VirtualSensor`: reads pairs of visual and tactile images from a twin that runs on a virtual clock."""
+"""`VirtualSensor`: reads visual and tactile images from a `Twin` (a simulated sensor) on a virtual clock."""
 
 import numpy as np
 
@@ -20,7 +20,7 @@ _ATTEMPTS = 10  # images of one stream without a proof of their light after whic
 
 
 class VirtualSensor:
-    """Reads pairs of visual and tactile images from a twin that runs on a virtual clock.
+    """Reads pairs of visual and tactile images from a `Twin` (a simulated sensor) that runs on a virtual clock.
 
     `hardware.collect` accepts a `VirtualSensor` in place of `hardware.STS`.
 
@@ -69,7 +69,7 @@ class VirtualSensor:
 
     @property
     def settling(self) -> Settling:
-        """The times (s) for which `read` waits after the lights were switched on or off."""
+        """The times (s) for which `read` waits: `visual_s` after the lights go off, `tactile_s` after they go on."""
         return self._settling
 
     @property
