@@ -237,11 +237,11 @@ DIFFERENCES = (
 
 
 def changed(clean: gap.Streams, difference: Difference, resolution: tuple[int, int], seed: int) -> gap.Streams:
-    """Add the imperfections and the lens of a `Difference` to clean images, and resize the images.
+    """Change clean images as an imperfect camera would: add imperfections, distort and resize the images.
 
     Args:
         clean: Images of the clean session at the resolution of the twin's camera, uint8.
-        difference: The difference.
+        difference: The imperfections to add, and whether the images are distorted as by a fisheye lens.
         resolution: Height and width of the result (pixels).
         seed: Seed of the noise.
     """

@@ -73,7 +73,7 @@ class MirroredFreefall(physics.Freefall):
     """The scenario `Freefall` with mirrored starts, for objects from `objects.mirror`."""
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-        """Return the mirror image of the start that `Freefall.start` draws for the unmirrored shape."""
+        """Sample an initial state with `Freefall.start` for the unmirrored shape, and reflect this state."""
         return mirror(super().start(key, mirror_shape(shape), pad))
 
 
@@ -81,7 +81,7 @@ class MirroredPerturbed(physics.Perturbed):
     """The scenario `Perturbed` with mirrored starts and jerks, for objects from `objects.mirror`."""
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-        """Return the mirror image of the start that `Perturbed.start` draws for the unmirrored shape."""
+        """Sample an initial state with `Perturbed.start` for the unmirrored shape, and reflect this state."""
         return mirror(super().start(key, mirror_shape(shape), pad))
 
 

@@ -184,7 +184,7 @@ def state_space() -> None:
 
 
 def main(args: Args) -> None:
-    """Measure the chosen kinds of models, and print a line for each step and prediction."""
+    """Measure the durations of training steps and predictions of the chosen models, and print a line for each."""
     print(f"{jax.devices()[0].device_kind}, {os.cpu_count()} cores")
     if args.only != "statespace":
         paper()

@@ -159,8 +159,8 @@ def soaked(folder: Path, name: str) -> Starts:
         This field is for benchmarks that simulate each initial state a second time.
 
     Raises:
-        FileNotFoundError: The folder has no blocks.
-        ValueError: The blocks were made with other settings. The message names all settings that differ.
+        FileNotFoundError: The folder has no stored trajectories of the scenario.
+        ValueError: The trajectories were made with other settings. The message names all settings that differ.
     """
     claimed, paths = folder / f"{name}.json", sorted(folder.glob(f"{name}-????.npz"))
     if not (claimed.exists() and paths):

@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import functools
 import hashlib
 import io
 import json
@@ -10,10 +11,14 @@ import platform
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import filelock
 import numpy as np
+import pydantic
+from pydantic_core import ErrorDetails
+
+Fields = TypeVar("Fields")  # a dataclass
 
 
 class DamagedFileError(OSError):
@@ -104,6 +109,46 @@ def read_json(path: Path, remedy: str) -> Any:
         raise
     except (OSError, ValueError) as error:  # ValueError: invalid UTF-8 or JSON, or an integer of thousands of digits
         raise DamagedFileError(f"{path} cannot be read as JSON ({error}): {remedy}.") from error
+
+
+def decode(kind: type[Fields], values: Any, name: str) -> Fields:
+    """Make a dataclass from JSON values, and check the types of the values.
+
+    A list becomes a tuple. A whole number becomes a float if the type of its field is float. A JSON object becomes a
+    nested dataclass.
+
+    Args:
+        kind: The dataclass. The types of its fields are numbers, strings, tuples, dataclasses, and unions of these.
+        values: The fields by name, such as the result of `json.loads` or `dataclasses.asdict`.
+        name: Name of the values in error messages, such as "device".
+
+    Returns:
+        The dataclass.
+
+    Raises:
+        ValueError: A field is missing, unknown or of a wrong type, or the dataclass refuses a value. The message names
+            the field.
+    """
+    try:
+        return _adapter(kind).validate_json(json.dumps(values), strict=True, extra="forbid")
+    except pydantic.ValidationError as error:
+        raise ValueError(_first_fault(error.errors()[0], name)) from error
+
+
+_adapter: Callable[[Any], pydantic.TypeAdapter[Any]] = functools.cache(pydantic.TypeAdapter)
+
+
+def _first_fault(fault: ErrorDetails, name: str) -> str:
+    """The message for the first fault that pydantic found."""
+    place = name + "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in fault["loc"])
+    match fault["type"]:
+        case "missing":
+            return f"field {place} is missing"
+        case "unexpected_keyword_argument":
+            return f"field {place} is unknown"
+        case "value_error":  # raised by the dataclass itself
+            return str(fault["ctx"]["error"])
+    return f"field {place} is {fault['input']!r}: {fault['msg']}"
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:

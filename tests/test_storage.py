@@ -1,9 +1,11 @@
 """Atomic writes, JSON files that cannot change unnoticed, checksums, and the lock on a folder."""
 
+import dataclasses
 import errno
 import hashlib
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -195,3 +197,48 @@ def test_a_file_instead_of_a_folder_cannot_be_locked(tmp_path):
             storage.lock(folder),
         ):
             pytest.fail("held")
+
+
+@dataclasses.dataclass(frozen=True)
+class Inner:
+    size: tuple[int, int]
+    scale: float = 1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Outer:
+    name: str
+    inner: Inner
+    parts: tuple[Inner, ...] = ()
+    limit: float | None = None
+
+    def __post_init__(self):
+        if not self.name:
+            raise ValueError("name must not be empty")
+
+
+def test_a_dataclass_is_the_same_after_json():
+    made = Outer("a", Inner((1, 2), 0.1), (Inner((3, 4)), Inner((5, 6))), limit=float("inf"))
+    values = json.loads(json.dumps(dataclasses.asdict(made)))
+    assert storage.decode(Outer, values, "outer") == made
+    again = storage.decode(Outer, {"name": "b", "inner": {"size": [1, 2], "scale": 3}}, "outer")
+    assert again == Outer("b", Inner((1, 2), 3.0))
+    assert isinstance(again.inner.scale, float)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"name": 3}, "field outer.name is 3: Input should be a valid string"),
+        ({"name": ""}, "name must not be empty"),
+        ({"colour": 3}, "field outer.colour is unknown"),
+        ({"inner": {}}, "field outer.inner.size is missing"),
+        ({"inner": {"size": [1, "2"]}}, "field outer.inner.size[1] is '2': Input should be a valid integer"),
+        ({"inner": {"size": [1, 2], "scale": True}}, "field outer.inner.scale is True: Input should be a valid number"),
+        ({"parts": [{"size": [1]}]}, "field outer.parts[0].size[1] is missing"),
+        ({"limit": "1"}, "field outer.limit is '1': Input should be a valid number"),
+    ],
+)
+def test_a_wrong_field_of_json_values_is_named(values, message):
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
+        storage.decode(Outer, {"name": "a", "inner": {"size": [1, 2]}} | values, "outer")

@@ -46,7 +46,7 @@ def sight(items: list[objects.Body]) -> Sight:
 
 
 def weighed(starts: Starts) -> np.ndarray:
-    """Exact value of the quantity that touch measures: the logarithm of the mass in kg, `(n, 1)`."""
+    """Exact value of the quantity that the sense of touch measures: the logarithm of the mass in kg, `(n, 1)`."""
     return np.log(starts.mass)[:, None]
 
 

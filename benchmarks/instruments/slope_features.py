@@ -1,7 +1,7 @@
 """Features from which a classifier predicts the outcomes of objects on the slope (`physics.Inclined`).
 
-The features come from vision, and optionally from the measured centre of pressure. They are results of statics: the
-support polygon of the object, and the place at which its weight acts. Downhill is +y.
+The features come from vision, and optionally from the measured centre of pressure. They describe whether the object
+stands stably: its support polygon, and the point at which its weight acts. Downhill is +y.
 """
 
 import math
@@ -119,7 +119,7 @@ def levelled(rotation: np.ndarray, ups: np.ndarray) -> np.ndarray:
 
 
 def pressed(starts: Starts) -> np.ndarray:
-    """Exact value of the quantity that touch measures: the centre of pressure.
+    """Exact value of the quantity that the sense of touch measures: the centre of pressure.
 
     Returns:
         `(-My, Mx) / Fz` of the wrench (m), `(n, 2)`, nan without contact.

@@ -71,11 +71,11 @@ class Views:
     backgrounds: Backgrounds | None  # images of the empty pad, if they are known
 
     def shown(self, image: Image) -> Image:
-        """Convert a raw image to the view of the sensor for display, uint8 RGB of shape (SIDE, SIDE, 3)."""
+        """Rectify and crop a raw image to the sensor's pad, for display, uint8 RGB of shape (SIDE, SIDE, 3)."""
         return hardware.rectified(self.lens, self.pinhole, image, (SIDE, SIDE))
 
     def floats(self, image: Image, resolution: tuple[int, int]) -> Float[np.ndarray, "height width 3"]:
-        """Convert a raw image to the view of the sensor with the resolution (height, width), float32 in [0, 1]."""
+        """Rectify and crop a raw image to the sensor's pad, with the resolution (height, width), float32 in [0, 1]."""
         return hardware.rectified(self.lens, self.pinhole, image, resolution).astype(np.float32) / 255
 
     def prepared(self, visual: Image, tactile: Image, empty: Mapping[str, np.ndarray]) -> hardware.SensorView:

@@ -102,8 +102,8 @@ class Page(Site):
     def still(self, path: str) -> Image | None:
         """The image of the current trajectory at a URL path such as `end/initial/visual.jpg`.
 
-        The second part of the path, `initial` or `final`, selects a pair of images. The third part selects the visual
-        or the tactile image of this pair.
+        The first part of the path is always `end`. The second part, `initial` or `final`, selects a pair of images. The
+        third part selects the visual or the tactile image of this pair.
         The result is None if the image was not taken yet, or if the path has another form.
         """
         head, _, rest = path.partition("/")

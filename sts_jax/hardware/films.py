@@ -128,8 +128,8 @@ class RecordedFilm(Film):
         if there < len(places):
             raise DamagedFileError(
                 f"{path} is truncated: it has {there} of the {len(places)} images that {FRAMES} lists for the {stream} "
-                f"stream. {_AGAIN.capitalize()}, or remove the lines of the missing images from {FRAMES} (the last "
-                f"{len(places) - there} with stream {stream!r})."
+                f"stream. {_AGAIN.capitalize()}, or remove the missing images from {FRAMES}: delete its last lines with "
+                f"stream {stream!r} (lines to delete: {len(places) - there})."
             )
 
     def image(self, index: int) -> Image:
@@ -187,7 +187,7 @@ def _lines(path: Path) -> list[tuple[Still, _Place]]:
 def _still(values: dict[str, Any]) -> Still:
     if values["stream"] not in ("visual", "tactile"):
         raise ValueError(f"stream must be 'visual' or 'tactile', got {values['stream']!r}")
-    lit = Lit(**{**values["before"], "levels": tuple(values["before"]["levels"])})
+    lit = storage.decode(Lit, values["before"], "before")
     still = Still(
         values["stream"], float(values["time_s"]), values["sequence"], values["epoch"], lit, float(values["until_s"])
     )

@@ -74,8 +74,8 @@ class Pace:
 
     After an interval of n + 1 periods between two frames, n frames count as lost. The attribute `dropped` is the number
     of all lost frames. If the next frames follow each other in less than one period, some or all of the n frames were
-    only late, not lost. `dropped` is then reduced by the number of late frames. Only `dropped` is corrected. The sum of
-    the numbers that `arrived` has returned can therefore be too large.
+    only late, not lost. `dropped` is then reduced by the number of late frames. The method `arrived` returns the number
+    of frames that seem to be lost at the time of its call. The sum of its results can therefore exceed `dropped`.
     """
 
     def __init__(self, nominal: float | None):

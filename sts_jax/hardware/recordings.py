@@ -505,7 +505,7 @@ def read_pair(path: Path, number: int, checksum: str | None = None) -> Pair:
     shots = {}
     for stream in _STREAMS:
         values = {name: value for name, value in content[stream].items() if name not in ("sha256", "taken", "shape")}
-        lit = Lit(**{**values.pop("before"), "levels": tuple(content[stream]["before"]["levels"])})
+        lit = storage.decode(Lit, values.pop("before"), f"{stream}.before")
         data = _checked(path / f"{stream}.png", content[stream]["sha256"], number)
         image = cv2.cvtColor(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
         image.flags.writeable = False

@@ -10,8 +10,6 @@ import io
 import math
 import os
 import re
-import types
-import typing
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -31,7 +29,6 @@ NAME = "sensor.json"  # name of the sensor file in a folder
 Stream = Literal["visual", "tactile"]
 
 _COMMISSION = "run `python -m experiments.commission`"
-_WORDS = {float: "a finite number", int: "a whole number", str: "a string"}
 
 
 class SensorFileError(ValueError):
@@ -247,7 +244,7 @@ class Device:
                 f"{VERSION}. Use the version of sts_jax that wrote the file, or {_COMMISSION} again."
             )
         try:
-            loaded = _decoded(cls, device, "device")
+            loaded = storage.decode(cls, device, "device")
         except ValueError as error:
             raise SensorFileError(f"{file}: {error}. Correct the file, or {_COMMISSION} again.") from error
         loaded._check_backgrounds(file)
@@ -359,44 +356,3 @@ def _checked_content(path: Path, background: Background) -> bytes:
 def _checked_image(path: Path, background: Background) -> NDArray[np.uint8]:
     with Image.open(io.BytesIO(_checked_content(path, background))) as image:
         return np.asarray(image)
-
-
-def _decoded(kind: Any, value: Any, name: str) -> Any:
-    """Convert a value of a JSON file to the type of a dataclass field.
-
-    Args:
-        kind: Type of the field.
-        value: Value in the file.
-        name: Name of the field, for error messages.
-    """
-    if typing.get_origin(kind) is types.UnionType:  # `kind | None`
-        return None if value is None else _decoded(typing.get_args(kind)[0], value, name)
-    if dataclasses.is_dataclass(kind):
-        return _decoded_dataclass(kind, value, name)
-    if typing.get_origin(kind) is tuple:
-        kinds = typing.get_args(kind)
-        if not isinstance(value, list) or len(value) != len(kinds):
-            raise ValueError(f"field {name} is {value!r}, but it must be a list of {len(kinds)} numbers")
-        return tuple(_decoded(k, v, name) for k, v in zip(kinds, value, strict=True))
-    allowed = int | float if kind is float else kind
-    if not isinstance(value, allowed) or isinstance(value, bool) or (kind is float and not math.isfinite(value)):
-        raise ValueError(f"field {name} is {value!r}, but it must be {_WORDS[kind]}")
-    return kind(value)
-
-
-def _decoded_dataclass(kind: Any, value: Any, name: str) -> Any:
-    """Convert a JSON object to a dataclass, all of whose fields must be present."""
-    kinds = typing.get_type_hints(kind)
-    known = [field.name for field in dataclasses.fields(kind)]
-    if not isinstance(value, dict):
-        raise ValueError(f"field {name} is {value!r}, but it must be a JSON object with the fields {', '.join(known)}")
-    for field in known:
-        if field not in value:
-            raise ValueError(f"field {name}.{field} is missing")
-    for field in value:
-        if field not in known:
-            raise ValueError(f"field {name}.{field} is unknown. The known fields are {', '.join(known)}")
-    try:
-        return kind(**{field: _decoded(kinds[field], value[field], f"{name}.{field}") for field in known})
-    except OverflowError as error:  # a whole number beyond float's range
-        raise ValueError(f"field {name} contains a whole number that is too large for a float ({error})") from error

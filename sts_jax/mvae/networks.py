@@ -20,6 +20,7 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from sts_jax import storage
 from sts_jax.mvae.convolutions import conv, conv_transpose
 from sts_jax.mvae.gaussian import Gaussian
 
@@ -104,8 +105,7 @@ class Config:
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> "Config":
         """Make a configuration from the result of `to_json`, or from the same values read from a JSON file."""
-        modalities = tuple(Modality(**{**m, "shape": tuple(m["shape"])}) for m in values["modalities"])
-        return cls(**{**values, "modalities": modalities, "widths": tuple(values["widths"])})
+        return storage.decode(cls, values, "model")
 
 
 class _Linear(nnx.Module):

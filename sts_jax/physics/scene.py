@@ -218,7 +218,7 @@ def template(
 
 
 def drawn(model: mujoco.MjModel, like: mjx.Model) -> dict[str, np.ndarray]:
-    """Read the fields that `set_rigid` changes from a model of C MuJoCo.
+    """Read fields of a model of C MuJoCo, namely those that `set_rigid` changes.
 
     Args:
         model: Model of C MuJoCo.

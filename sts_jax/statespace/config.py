@@ -3,6 +3,7 @@
 import dataclasses
 from typing import Any
 
+from sts_jax import storage
 from sts_jax.statespace import harmonics
 
 IMAGES = ("visual", "tactile")  # names of the images
@@ -111,5 +112,4 @@ class Config:
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> "Config":
         """Make a configuration from the result of `to_json`, or from the same values read from a JSON file."""
-        plain: dict[str, Any] = {k: tuple(value) if isinstance(value, list) else value for k, value in values.items()}
-        return cls(**plain)
+        return storage.decode(cls, values, "model")

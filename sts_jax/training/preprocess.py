@@ -4,7 +4,6 @@ The `config.json` of a trained model contains the values of the fields of its `P
 """
 
 import dataclasses
-import json
 from typing import Any, Literal
 
 import jax
@@ -12,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8
 
-from sts_jax import geometry
+from sts_jax import geometry, storage
 
 # The contact test of noisy images. It has the same values as the contact test of the collection of recordings
 # (`hardware.GuideConfig`).
@@ -233,13 +232,10 @@ def preprocessing_from_json(content: dict) -> Preprocessing:
         ValueError: The values do not describe a preprocessing.
     """
     try:
-        content = json.loads(json.dumps(content))
-        content["resolution"] = tuple(content["resolution"])
-        content["absent"] = tuple(content["absent"])
-        content["condition_scale"] = tuple(content.get("condition_scale", ()))  # older models have no condition
-        content["scales"] = tuple((name, float(scale)) for name, scale in content.get("scales", ()))
-        return Preprocessing(**content)
-    except (KeyError, TypeError, ValueError) as error:
+        if "resolution" not in content:  # it has a default value, but every model stores it
+            raise ValueError("field preprocessing.resolution is missing")
+        return storage.decode(Preprocessing, content, "preprocessing")
+    except (TypeError, ValueError) as error:  # TypeError: a value that JSON does not have
         raise ValueError(
             f"{content!r} does not describe a preprocessing ({type(error).__name__}: {error}): train the model with "
             "training.train(..., preprocessing=dataclasses.asdict(p)), where p is a training.Preprocessing."

@@ -6,7 +6,9 @@ import json
 import os
 import threading
 from pathlib import Path
-from typing import Any, BinaryIO, TextIO
+from typing import BinaryIO, TextIO
+
+from sts_jax import storage
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,5 +87,5 @@ def read_log(path: str | os.PathLike) -> list[Exposure]:
         OSError: The file cannot be read.
     """
     text = Path(path).read_text()
-    rows: list[dict[str, Any]] = [json.loads(line) for line in text[: text.rfind("\n") + 1].splitlines()]
-    return [Exposure(**row | {"pose": None if row["pose"] is None else tuple(row["pose"])}) for row in rows]
+    lines = text[: text.rfind("\n") + 1].splitlines()
+    return [storage.decode(Exposure, json.loads(line), "frame") for line in lines]
