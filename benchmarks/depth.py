@@ -57,7 +57,10 @@ class Difference(NamedTuple):
 
 
 def make(name: str) -> objects.Body:
-    """Make one of the ten objects, 50 to 130 mm long. Loaded objects lose their textures, which depth does not need."""
+    """Make one of the ten objects, 50 to 130 mm long.
+
+    An object from a mesh file has no texture here, because a texture does not change the depth image.
+    """
     if name in PROCEDURAL:
         return objects.make(jax.random.key(5), name)
     with warnings.catch_warnings(), tempfile.TemporaryDirectory() as folder:

@@ -126,7 +126,12 @@ def release(device: twin.Twin) -> None:
 
 @contextlib.contextmanager
 def recording(folder: Path, note: str) -> Iterator[hardware.Session]:
-    """Open a session in a folder, and write all of its images at the end. `note` describes the session."""
+    """Open a session in a folder for the duration of a `with` block. All images have been written when the block ends.
+
+    Args:
+        folder: Folder of the session.
+        note: Description of the session, which is stored with it.
+    """
     origin = hardware.Origin(note, "TWIN", SIZE[1], SIZE[0], ON)
     with hardware.Session.open(folder, origin) as session:
         yield session

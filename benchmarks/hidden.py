@@ -212,7 +212,8 @@ def lesson(study: Study, items: list[objects.Body], starts: Starts, others: int)
 def pictures(study: Study, learned: Lesson, starts: Starts, steps: int) -> np.ndarray:
     """Estimate the measurement of touch from tactile images with a network.
 
-    The measurement is the logarithm of the mass on the jerked pad, and the centre of pressure on the slope.
+    In the scenario of the jerked pad, touch measures the logarithm of the mass. In the scenario of the slope, touch
+    measures the centre of pressure.
 
     Args:
         study: Settings of the scenario.

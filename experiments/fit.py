@@ -47,7 +47,7 @@ FAINT = 0.25
 
 @dataclasses.dataclass(frozen=True)
 class Config(sense.Config):
-    """The object, its true pose, and the number of fits."""
+    """Options of the command line: the object, its true pose, and the number of fits."""
 
     mesh: Annotated[str, tyro.conf.Positional]  # path of a mesh file, or name of an object class
     out: Path = Path("fit.png")  # path of the picture

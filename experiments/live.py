@@ -156,13 +156,18 @@ def replayed(config: Config) -> Source:
 
 
 def views(config: Config, source: Source, first: hardware.Shot) -> Views:
-    """Make the conversion from raw images to rectified images, which show the view of the sensor's pinhole camera.
+    """Return a `Views`, which converts raw images to rectified images.
+
+    A rectified image is the image that the sensor's pinhole camera would take.
 
     Args:
         config: Options of the command line.
         source: Source of the images.
         first: Any image of the source. Without a sensor file, an ideal lens for images of the size of `first` is
             assumed.
+
+    Returns:
+        The object that converts the images.
     """
     if source.file is None:
         height, width = first.image.shape[:2]

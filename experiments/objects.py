@@ -8,8 +8,8 @@ without names, so that other people can try to recognise them.
 
 A line is printed for each object: its size, its number of faces, the number of vertices of its collision hull, and two
 gaps. The first gap is the largest distance by which the surface lies outside the hull. The second gap is the largest
-distance by which the hull lies outside the surface. With `--parts`, each object whose hull fits badly is decomposed into
-convex parts before its gaps are measured. This takes about ten seconds per object.
+distance by which the hull lies outside the surface. With `--parts`, each object whose hull fits badly is decomposed
+into convex parts before its gaps are measured. This takes about ten seconds per object.
 """
 
 import dataclasses
@@ -38,7 +38,7 @@ EYES = {  # direction from the object to the camera: x right, y back, z up
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Options of the command: the objects in the picture, the direction of the view, and the path of the picture."""
+    """Options of the command line: the objects in the picture, the direction of the view, and the picture's path."""
 
     out: Path = Path("objects.png")  # path of the picture
     seed: int = 0  # seed of the objects

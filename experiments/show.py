@@ -30,7 +30,7 @@ SCENARIOS = {
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Options of the command: scenario, number of trajectories, seed, folder of the pictures, and image size."""
+    """Options of the command line: scenario, number of trajectories, seed, folder of the pictures, and image size."""
 
     scenario: Annotated[str, tyro.conf.Positional]  # name of the scenario: freefall, inclined, perturbed or released
     num: int = 4  # number of trajectories, each with another object

@@ -26,7 +26,7 @@ from sts_jax.hardware import Lens, twin
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Options of the command: the twin's camera, its object, and its serial port and HTTP server."""
+    """Options of the command line: the twin's camera, its object, and its serial port and HTTP server."""
 
     resolution: tuple[int, int] = (480, 640)  # height and width of the frames (pixels)
     rate: float = 30.0  # frame rate of the camera (frames/s)

@@ -47,9 +47,9 @@ def ceilings(
     """Read the re-rolls of the first `num` held-out trajectories, or compute and write the re-rolls.
 
     A re-roll is a new simulation from the first pose of a trajectory, with newly drawn hidden properties such as
-    friction. The re-rolls are in `ceiling{suffix}.npz`. `ceiling{suffix}.json` records the checksums of the inputs of
-    the computation. If an input has changed, the re-rolls are computed again. A change in the code of a
-    metric has no effect on existing re-rolls, because functions cannot be compared.
+    friction. The re-rolls and their scores are in `ceiling{suffix}.npz`. `ceiling{suffix}.json` records the checksums
+    of the inputs of the computation. If an input has changed, the re-rolls are computed again. The code of a metric has
+    no checksum. After a change of this code, delete the two files.
 
     Args:
         workdir: Work directory.

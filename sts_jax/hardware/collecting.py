@@ -66,7 +66,7 @@ class PairReader(Protocol):
 
 @runtime_checkable
 class Person(Protocol):
-    """The interface between `collect` and the person who moves the objects, such as a web page or a terminal.
+    """The interface, such as a web page or a terminal, between `collect` and the person who moves the objects.
 
     Each method must return immediately, because `collect` reads no images until the method returns.
     """

@@ -4,11 +4,15 @@ The guide is a pure function of a state and a pair of images (one visual, one ta
 places an object on the pad and holds it (stages `PLACE` and `HOLD`), releases it (`RELEASE`), and waits until it rests
 (`STILL`).
 
-Each image is divided into 24 rows of 32 blocks. A movement is a change of a block's mean colour between two images. The
-noise of single pixels averages out in the mean colour. A contact is detected if the mean colours of some blocks differ
-between the current tactile image and a tactile image of the empty pad. The blocks for contacts have half the width and
-height of the other blocks, because a contact can be small. Changes and differences count only if they exceed a
-threshold. The threshold is a multiple of the noise that the mean colour has on the empty pad.
+The guide compares the mean colours of blocks of pixels, because the noise of single pixels averages out in them:
+
+- A movement is a change of a block's mean colour between two images. For this purpose, each image is divided into 24
+  rows of 32 blocks.
+- A contact is a difference between the mean colours of a block in the current tactile image and in a tactile image of
+  the empty pad. For this purpose, the images are divided into 48 rows of 64 blocks, because a contact can be small.
+
+Changes and differences count only if they exceed a threshold. The threshold is a multiple of the noise that the mean
+colour has on the empty pad.
 """
 
 import dataclasses

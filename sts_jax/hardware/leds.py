@@ -159,8 +159,9 @@ class Leds:
             leds.close()
         found = ", ".join(f"{name} ({result})" for name, result in tried.items()) or "none"
         raise ports.PortNotFoundError(
-            f"LED controller {serial_number} was not found on any USB port. Connect it by USB. If its port is not a "
-            "USB device, pass the name of the port to `Leds.connect`, or to `STS.from_file` as the argument `leds`. "
+            f"LED controller {serial_number} was not found on any USB port. Connect it to a USB port. If it is "
+            "connected to a port of another kind, pass the name of this port to `Leds.connect`, or to `STS.from_file` "
+            "as the argument `leds`. "
             f"USB ports tried: {found}."
         )
 

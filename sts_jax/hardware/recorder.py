@@ -5,8 +5,8 @@ A recording is a folder:
     recording.json    version of the format, encoding, and identity of the sensor
     visual.mkv        images without light, as a Matroska video that other programs can play
     tactile.mkv       images with light, as a Matroska video
-    frames.jsonl      one line for each image: its time, its position in the video file, and the period in which the
-                      lights did not change
+    frames.jsonl      one line for each image: its time, its position in the video file, and the times before and after
+                      its exposure between which the lights did not change
     sensor.json       only if a sensor file was given: a copy of this file. Its background images are copied too
 
 Each image is written before its line in frames.jsonl. After an interruption at any time, each complete line therefore

@@ -48,7 +48,10 @@ def frame_arrays(
     """
     lacking = [own.name for own in measurements if own.name not in pairs.measurements]
     if lacking:
-        raise ValueError(f"pairs.measurements lacks {', '.join(lacking)}: pass the same measurements to Dataset.pairs")
+        raise ValueError(
+            f"pairs.measurements lacks {', '.join(lacking)}: pass the argument measurements of this function also to "
+            "Dataset.pairs"
+        )
     scales = tuple((own.name, float(own.scale)) for own in measurements if not own.is_image)
     preprocessing = dataclasses.replace(preprocessing, scales=scales)
     code = np.asarray(_pose_codes(preprocessing, pairs.pose))
