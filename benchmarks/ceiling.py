@@ -8,7 +8,7 @@ A start is the initial state of a trajectory. A re-roll is another simulation fr
 values of the hidden properties, such as friction and mass. The command uses the metrics and the held-out starts of the
 scenario's experiment. The command prints the errors of these predictions:
 
-- the mean of the re-rolls, which is the best prediction from shape, pose and condition (such as the jerk of the pad)
+- the mean of the re-rolls, which is the best prediction from shape, pose and condition (such as the pad's acceleration)
 - the last frame of a single re-roll. Its image is as sharp as a true image
 - the baselines, which are simple predictions without a model, such as a copy of the first frame
 

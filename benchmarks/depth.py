@@ -57,7 +57,7 @@ class Difference(NamedTuple):
 
 
 def make(name: str) -> objects.Body:
-    """Make one of the ten objects, 50 to 130 mm long.
+    """Make the object with the given name, one of the ten objects of this benchmark. They are 50 to 130 mm long.
 
     An object from a mesh file has no texture here, because a texture does not change the depth image.
     """
@@ -88,10 +88,11 @@ def places(body: objects.Body, rng: np.random.Generator, kind: str) -> tuple[jax
     Args:
         body: The object.
         rng: Source of the random pose.
-        kind: One of `POSES`: `touching` (the pad), `above` (the pad), or `out of view` (in part).
+        kind: "touching" if the object touches the pad, "above" if it is above the pad, or "out of view" if it is partly
+            out of view.
 
     Returns:
-        The pose `(7,)` and the wrench `(6,)`. For the kind `touching`, the wrench is due to a force of 1 N upwards at
+        The pose `(7,)` and the wrench `(6,)`. For the kind "touching", the wrench is due to a force of 1 N upwards at
         the object's lowest point. For the other kinds, the wrench is zero.
     """
     quat = rng.normal(size=4)
@@ -118,7 +119,7 @@ def cases(body: objects.Body, seed: int, numbers: Sequence[int] = NUM_POSES) -> 
     Args:
         body: The object.
         seed: Seed of the random poses.
-        numbers: Number of poses that touch the pad, that are above the pad, and that are partly out of view.
+        numbers: Three numbers of poses: touching the pad, above the pad, and partly out of view.
 
     Yields:
         A pose `(7,)` and its wrench `(6,)`, see `places`.
@@ -130,11 +131,14 @@ def cases(body: objects.Body, seed: int, numbers: Sequence[int] = NUM_POSES) -> 
 
 
 def difference(depth: np.ndarray, truth: np.ndarray) -> Difference:
-    """Compare a depth image with embree's.
+    """Compare a depth image with the depth image of the ray tracer Embree.
 
     Args:
         depth: The rendered depth (m), `(h, w)`, infinite where a ray misses the object.
         truth: Embree's depth (m), `(h, w)`, infinite where a ray misses the object.
+
+    Returns:
+        Numbers of pixels with certain errors, and the largest error in the interior of the object.
     """
     seen, hit = np.isfinite(depth), np.isfinite(truth)
     inner = interior(truth)
@@ -157,7 +161,10 @@ def difference(depth: np.ndarray, truth: np.ndarray) -> Difference:
 
 
 def total(differences: Sequence[Difference]) -> Difference:
-    """Combine the differences of several images: sum the pixel counts, and take the largest of the interior errors."""
+    """Combine the depth differences of several images.
+
+    The pixel counts are added. `worst`, the largest depth error in interior pixels, is the maximum over all images.
+    """
     added = {name: sum(getattr(d, name) for d in differences) for name in Difference._fields if name != "worst"}
     return Difference(**added, worst=max(d.worst for d in differences))
 
@@ -165,18 +172,18 @@ def total(differences: Sequence[Difference]) -> Difference:
 def measure(
     names: Sequence[str], shape: tuple[int, int], numbers: Sequence[int] = NUM_POSES, *, first_seed: int = 0
 ) -> dict[str, Difference]:
-    """Compare the depth of rendered frames with embree's.
+    """Compare the depth in rendered frames with the depth that the ray tracer embree computes.
 
     Embree traces the object in the pose `Frame.pose`, in which the gel balances the wrench.
 
     Args:
         names: Names of the objects, from `PROCEDURAL`, `LOADED` and `MADE`.
         shape: Height and width of the images (pixels).
-        numbers: Number of poses that touch the pad, that are above the pad, and that are partly out of view.
+        numbers: Three numbers of poses: touching the pad, above the pad, and partly out of view.
         first_seed: Offset of the seeds of the random poses.
 
     Returns:
-        The differences by name of the object. The differences of all images of an object are combined by `total`.
+        The differences by name of the object. `total` combines the differences of all images of an object.
     """
     sensor = sts.Sensor()
     sense = jax.jit(lambda *inputs: sts.sense(sensor, *inputs, resolution=shape))
@@ -194,7 +201,7 @@ def measure(
 
 
 def describe(d: Difference) -> str:
-    """Format the differences from embree's depth, of one or more images together, as one row of the printed table."""
+    """Format a `Difference` between depth images and embree's depth images as one row of the printed table."""
     rest = max(d.elsewhere, 1)
     return (
         f"{d.interior:9} {100 * (1 - d.interior_beyond_10um / max(d.interior, 1)):9.4f} {d.interior_beyond_100um:7} "
@@ -204,7 +211,7 @@ def describe(d: Difference) -> str:
 
 
 def main() -> None:
-    """Print a row of differences for each image size and object, and their sum for each image size."""
+    """Print the differences from embree's depth for each image size, in a row for each object and a row for all."""
     print(f"{'':28} interior  % <10 um  >100um  worst um elsewhere  % <1 mm silhouette  differs  strays")
     for shape in SIZES:
         found = measure(PROCEDURAL + LOADED + MADE, shape)

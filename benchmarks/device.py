@@ -49,7 +49,7 @@ class Args:
     """Options of the command line.
 
     Raises:
-        ValueError: The tuple `lags_ms` is empty, or has more values than `pairs`.
+        ValueError: `lags_ms` is empty, or the number of its values is larger than the number `pairs`.
     """
 
     pairs: int = 1000  # number of pairs of images, of all lags together
@@ -66,7 +66,10 @@ class Args:
 
 
 class Measured(NamedTuple):
-    """Results of the pairs that were read at one lag of the emulated camera."""
+    """Results of the pairs of images that were read at one lag of the emulated camera.
+
+    The lag is the time from the end of an exposure to the sending of the frame.
+    """
 
     lag_ms: float
     settling: hardware.Settling  # as `hardware.STS` measured it
@@ -152,7 +155,7 @@ def measure(lag_ms: float, pairs: int, path: Path, *, twin: bool) -> Measured:
 
 
 def report(found: list[Measured]) -> str:
-    """Format the results as a table with a row for each lag."""
+    """Format the results as a table with a row for each lag of the camera."""
     lines = ["lag (ms)  settling off, on (ms)  frames/s  pairs  wrong or mixed  pairs/s  limit  share  discarded  lost"]
     for row in found:
         settled = f"{1000 * row.settling.visual_s:.0f}, {1000 * row.settling.tactile_s:.0f}"
@@ -169,7 +172,7 @@ def report(found: list[Measured]) -> str:
 
 
 def measure_all(args: Args) -> list[Measured]:
-    """Read an equal share of the pairs at each lag, and return the results for each lag."""
+    """Read an equal share of the image pairs at each lag of the camera (`--lags-ms`), and return one result per lag."""
     number = len(args.lags_ms)
     found = []
     with tempfile.TemporaryDirectory() as folder:

@@ -376,9 +376,10 @@ def kill(bench: Bench, count: Count) -> None:
         _until(lambda: time.monotonic() > wait_s and lights.off_after(0.0) is None, 60)
         if process.poll() is not None or lights.off_after(0.0) is not None:
             raise RuntimeError(
-                "the benchmark kills the program that reads the sensor while a light is on, but no light was on within "
-                f"60 s, or the program ended too early. The exit status of the program is {process.poll()} (None: the "
-                "program still runs). If the status is a number, see the program's error output above"
+                "no light was on within 60 s, or the program that reads the sensor ended too early, so the benchmark "
+                "could not kill this program while a light was on. The exit status of the program is "
+                f"{process.poll()} (None: the program still runs). If the status is a number, see the program's error "
+                "output above"
             )
         process.send_signal(signal.SIGKILL)
         process.wait()
@@ -420,10 +421,13 @@ def measure(args: Args) -> dict[str, Count]:
 
 
 def measure_part(order: list[str], seed: int, long: float) -> dict[str, Count]:
-    """Inject faults into one emulated sensor with a random lag and a random exposure time.
+    """Inject faults into one emulated sensor, whose camera has a random exposure time and a random lag.
+
+    The lag is the time from the end of an exposure to the sending of the frame.
 
     Args:
-        order: Kind of each fault, in the order of injection. Faults of the kind KILLED come last in any case.
+        order: Kind of each fault, in the order of injection. Faults of the kind KILLED, in which the reading process is
+            killed, always come last.
         seed: Seed of all random numbers.
         long: Share of long faults (5 to 7 s) among the faults of variable length.
 

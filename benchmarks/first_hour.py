@@ -50,7 +50,7 @@ def waiting() -> None:
 
 
 def rates() -> None:
-    """Print the rates of `jax.vmap` and `jax.lax.map` for frames and for gradients."""
+    """Print how many frames and how many gradients per second are computed with `jax.vmap` and with `jax.lax.map`."""
     body = sts.objects.make(jax.random.key(0), CLASS)
     sensor = sts.Sensor()
     placed = [sts.physics.place(body, sensor, yaw=float(yaw)) for yaw in jnp.linspace(0, 3, FRAMES)]

@@ -216,7 +216,10 @@ def sessions(args: Args) -> hardware.Recordings:
 
 @dataclasses.dataclass(frozen=True)
 class Difference:
-    """A known difference from clean images: imperfections of the digital twin, and optionally its fisheye lens."""
+    """A change that the benchmark applies to clean images: imperfections of a camera, and optionally a fisheye lens.
+
+    Clean images are images of a digital twin that has almost no imperfections.
+    """
 
     name: str  # title of the row in the table
     imperfections: twin.Imperfections = CLEAN
@@ -225,7 +228,7 @@ class Difference:
 
 
 def levels(field: str, values: tuple[Any, ...]) -> list[Difference]:
-    """Create one `Difference` for each value of one field of `twin.Imperfections`."""
+    """Create one `Difference` for each value of a field of `twin.Imperfections`. Other fields are as in `CLEAN`."""
     return [Difference(f"{field} {value:g}", dataclasses.replace(CLEAN, **{field: value})) for value in values]
 
 
@@ -245,7 +248,7 @@ def changed(clean: gap.Streams, difference: Difference, resolution: tuple[int, i
     """Change clean images as an imperfect camera would: add imperfections, distort and resize the images.
 
     Args:
-        clean: Images of the clean session at the resolution of the twin's camera, uint8.
+        clean: Images of a twin without imperfections, at the resolution of the twin's camera, uint8.
         difference: The imperfections to add, and whether the images are distorted as by a fisheye lens.
         resolution: Height and width of the result (pixels).
         seed: Seed of the noise.
@@ -300,7 +303,7 @@ def row(name: str, first: gap.Streams, second: gap.Streams, *, matched: bool) ->
 
 
 def table(clean: gap.Streams, resolution: tuple[int, int]) -> Iterator[str]:
-    """Yield the lines of the table, which compares images without imperfections with changed copies of these images.
+    """Yield the lines of the table of differences between clean images and changed copies of these images.
 
     Args:
         clean: Images without imperfections, at the resolution of the twin's camera.

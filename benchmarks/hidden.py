@@ -105,8 +105,8 @@ class Args:
     """Options of the command line.
 
     Raises:
-        ValueError: A requested part does not exist for the scenario, or `soaked` is combined with `objects`, `again` or
-            `keep`, which `soaked` replaces.
+        ValueError: A requested part of the report does not exist for the scenario. Or `soaked`, a folder of simulated
+            trajectories, is combined with `objects`, `again` or `keep`, which are options for a new simulation.
     """
 
     parts: tyro.conf.Positional[tuple[Part, ...]] = ()  # parts of the printed report (default: all for the scenario)
@@ -135,8 +135,9 @@ def outcomes(study: Study, starts: Starts) -> None:
     """Print the shares of outcomes, of unsettled starts, and of starts whose outcome changes with other contents.
 
     A start is the initial state of a trajectory. The outcome is how the trajectory ends, such as by toppling. A start
-    is unsettled if its object is still on the pad and not at rest at the end of the trajectory. The other contents have
-    a new random fill level and, on the slope, lie on a new side.
+    is unsettled if its object is still on the pad and not at rest at the end of the trajectory. For the last share,
+    trajectories were simulated again from the same start with other random contents of the object: another fill level
+    and, in the scenario `inclined`, contents that lie on another side of the object.
     """
     share = functools.partial(classifier.interval, classifier.mean, groups=starts.body)
     for outcome in study.scenario.outcomes:
@@ -169,7 +170,9 @@ def losses(study: Study, items: list[objects.Body], starts: Starts, touch: np.nd
 
 
 def gains(study: Study, items: list[objects.Body], starts: Starts, read: np.ndarray | None) -> None:
-    """Print the log losses of classifiers without and with touch, and the gain, the relative decrease of the loss.
+    """Print the log losses of classifiers that predict the outcome without and with touch, and the gain.
+
+    The gain is the relative decrease of the log loss through touch.
 
     Args:
         study: Settings of the scenario.
@@ -196,7 +199,9 @@ def gains(study: Study, items: list[objects.Body], starts: Starts, read: np.ndar
 
 
 def lesson(study: Study, items: list[objects.Body], starts: Starts, others: int) -> Lesson:
-    """Make the training data of the networks that read tactile images, and the images under study.
+    """Render tactile images of training objects and of the objects under study.
+
+    Networks are trained on the images of the training objects, and are then applied to the images under study.
 
     Args:
         study: Settings of the scenario.
@@ -210,19 +215,19 @@ def lesson(study: Study, items: list[objects.Body], starts: Starts, others: int)
 
 
 def pictures(study: Study, learned: Lesson, starts: Starts, steps: int) -> np.ndarray:
-    """Estimate the measurement of touch from tactile images with a network.
+    """Train a network on tactile images, and return its estimates of the quantity that touch measures.
 
-    In the scenario of the jerked pad, touch measures the logarithm of the mass. In the scenario of the slope, touch
-    measures the centre of pressure.
+    In the scenario of the jerked pad, this quantity is the logarithm of the mass. In the scenario of the slope, it is
+    the centre of pressure.
 
     Args:
         study: Settings of the scenario.
         learned: Training data of the network, and the images under study.
-        starts: The starts under study.
+        starts: The starts that the images under study show.
         steps: Training steps of the network.
 
     Returns:
-        The measurement of touch, `(n, k)`, nan without contact.
+        The estimates for the images under study, `(n, k)`, nan without contact.
     """
     touch = study.touch(learned.starts)
     known = np.isfinite(touch).all(1)
@@ -254,10 +259,12 @@ def aloft(key: PRNGKeyArray, items: list[objects.Body], num: int) -> tuple[Start
 
 
 def detect(name: str, images: np.ndarray, starts: Starts, new: np.ndarray, held_out: Starts, steps: int) -> None:
-    """Print the AUC of a network that detects whether the held-out object in an image is more than half full.
+    """Train a network to detect whether the object in an image is more than half full, and print its AUC.
+
+    The AUC is computed for the images of held-out objects.
 
     Args:
-        name: Name of the images.
+        name: Name of the images, for the printed line.
         images: Training images, uint8 `(n, h, w, 3)`.
         starts: Starts that the training images show.
         new: Images of held-out objects, uint8 `(m, h, w, 3)`.
@@ -292,7 +299,11 @@ def fill(learned: Lesson, items: list[objects.Body], starts: Starts, num: int, s
 
 
 def begun(study: Study, args: Args) -> tuple[list[objects.Body], Starts]:
-    """Return the objects and their starts, which are loaded from `--soaked` or `--keep`, or simulated."""
+    """Return the objects, and the initial states and outcomes of their trajectories.
+
+    With `--soaked`, the trajectories are loaded from that folder. Otherwise, they are simulated, unless the folder
+    `--keep` already contains them.
+    """
     if args.soaked is not None:
         starts = soak.soaked(args.soaked, args.scenario)
         return bodies(study.categories, int(starts.body.max()) + 1), starts
@@ -307,7 +318,7 @@ def begun(study: Study, args: Args) -> tuple[list[objects.Body], Starts]:
 
 
 def main(args: Args) -> None:
-    """Load or simulate the starts, and print the requested parts."""
+    """Load or simulate the starts (initial states of trajectories), and print the requested parts of the report."""
     study = STUDIES[args.scenario]
     parts = set(args.parts or study.parts)
     items, starts = begun(study, args)

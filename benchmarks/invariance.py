@@ -16,17 +16,17 @@ ways, which are called sides:
 - "C MuJoCo": C MuJoCo with a plain model. The contacts are those that C MuJoCo finds for the mesh
 - "C, every vertex": C MuJoCo with a contact sphere at every vertex of the hull. The contacts that C MuJoCo finds for
   the mesh act only where a rim of the pad presses against the hull between the vertices
-- "C, every vertex, driven pad", for jerked bottles only: the same, but the pad is accelerated on slides under constant
-  gravity. On all other sides, the pad is fixed and the jerk is a change of gravity
+- "C, every vertex, driven pad", for jerked bottles only: the same, but the pad is accelerated on slide joints under
+  constant gravity. On all other sides, the pad is fixed and the jerk is a change of gravity
 
 C MuJoCo keeps at most four contacts of a mesh that stands on a face. A round base thus becomes a square that is up to
 30 % narrower, and rocks and walks more. With a contact at every vertex, C MuJoCo has the same contacts as the side
 "ours".
 
-The command prints the share of each label on our side and on each other side, with the 95 % interval of the difference.
-All sides have the same starts and hidden properties (such as friction), so each run on our side is paired with a run on
-each other side. The interval is computed for paired proportions (Agresti and Min 2005, with half a count added to each
-cell). The command writes no files.
+The command prints the share of each label on the side "ours" and on each other side, with the 95 % interval of the
+difference. All sides have the same starts and hidden properties (such as friction), so each run on the side "ours" is
+paired with a run on each other side. The interval is computed for paired proportions (Agresti and Min 2005, with half a
+count added to each cell). The command writes no files.
 """
 
 import concurrent.futures
@@ -78,7 +78,7 @@ class MirroredFreefall(physics.Freefall):
 
 
 class MirroredPerturbed(physics.Perturbed):
-    """The scenario `Perturbed` with mirrored starts and jerks, for objects from `objects.mirror`."""
+    """The scenario `Perturbed` with mirrored poses and pad accelerations, for objects from `objects.mirror`."""
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
         """Sample an initial state with `Perturbed.start` for the unmirrored shape, and reflect this state."""
@@ -86,12 +86,12 @@ class MirroredPerturbed(physics.Perturbed):
 
 
 def mirror(start: Start) -> Start:
-    """Mirror the pose of a start and the condition, such as an acceleration of the pad, so that y becomes -y."""
+    """Mirror a start, so that y becomes -y in its pose and in its condition (such as an acceleration of the pad)."""
     return start._replace(pose=turn(start.pose, 4), condition=turn_condition(start.condition, 4))
 
 
 def mirror_shape(shape: Shape) -> Shape:
-    """Mirror a shape, as `objects.mirror` mirrors a body."""
+    """Mirror the geometry of a body so that y becomes -y in the mesh frame, as `objects.mirror` does."""
     flip = np.array([1, -1, 1], np.float32)
     return shape._replace(points=shape.points * flip, rests=shape.rests * flip, coms=shape.coms * flip)
 
@@ -138,7 +138,7 @@ def bottle_side(first: Float[Array, "7"], last: Float[Array, "7"]) -> Array:
 
 
 def cases() -> list[Case]:
-    """Make the three cases: the box, the bottle and the jerked bottles."""
+    """Make the three cases: a dropped box, a dropped bottle, and standing bottles on a pad that is jerked sideways."""
     bottles = [objects.make(jax.random.key(i), "bottle") for i in range(4)]
     squat = objects.make(jax.random.key(27), "bottle")  # 101 mm high, 44 mm wide
     small, middle, large = (f"on {1e3 * a:.0f} x {1e3 * b:.0f} mm" for a, b in ((BOX[1], BOX[2]), BOX[::2], BOX[:2]))
@@ -161,13 +161,13 @@ def roll(
     seed: int = 0,
     engine: physics.Engine = "mjx",
 ) -> physics.Trajectory:
-    """Simulate runs of a case.
+    """Simulate trajectories of a case, which consists of a scenario and bodies.
 
     Args:
         case: The case.
-        num: Number of runs, rounded up to a multiple of the number of bodies.
-        bodies: Bodies that replace the case's bodies.
-        scenario: A scenario that replaces the case's scenario.
+        num: Number of trajectories, rounded up to a multiple of the number of bodies.
+        bodies: Bodies that replace the case's bodies (default: no replacement).
+        scenario: A scenario that replaces the case's scenario (default: no replacement).
         seed: Seed of starts and hidden properties, such as friction.
         engine: Engine of `simulate`.
 
@@ -204,7 +204,7 @@ def c_model(body: objects.Body, contact: physics.Contact, every_vertex: bool, dr
         contact: Constants of the contact.
         every_vertex: Add a contact sphere at every vertex of the hull. Otherwise, the only contacts are those that C
             MuJoCo finds for the mesh.
-        driven: Put the pad on two slides, along x and y. Otherwise the pad is fixed.
+        driven: Give the pad two slide joints, along x and y. Otherwise the pad is fixed.
     """
     gel, parts = Sensor().gel.size, np.asarray(body.hulls)
     xml = scene.scene_xml(parts, (float(gel[0]), float(gel[1])), contact)
@@ -225,14 +225,14 @@ def c_model(body: objects.Body, contact: physics.Contact, every_vertex: bool, dr
 
 
 def last_in_c(case: Case, traj: physics.Trajectory, *, every_vertex: bool = False, driven: bool = False) -> np.ndarray:
-    """Simulate in C MuJoCo, from the first frames of given trajectories.
+    """Simulate given trajectories again, from their first frames, in C MuJoCo.
 
     Args:
-        case: The case.
+        case: Scenario and bodies of the trajectories.
         traj: Trajectories of the case. Their starts and hidden properties, such as friction, are used.
         every_vertex: Add a contact sphere at every vertex of the hull.
-        driven: Keep gravity vertical and accelerate the pad, opposite to the horizontal part of the scenario's gravity.
-            Otherwise the pad is fixed and gravity is the scenario's.
+        driven: If True, only the vertical part of the scenario's gravity acts, and the pad accelerates with the
+            negative of the horizontal part. If False, the pad is fixed, and the whole gravity of the scenario acts.
 
     Returns:
         The last poses in the pad's frame, `(n, 7)`.
@@ -277,7 +277,13 @@ def last_in_c(case: Case, traj: physics.Trajectory, *, every_vertex: bool = Fals
 
 
 def named(case: Case, first: Array | np.ndarray, last: Array | np.ndarray) -> np.ndarray:
-    """Index of the label of each run, `(n,)`, from its first and last poses, `(n, 7)` each."""
+    """Return the index of each run's label in `case.labels`, `(n,)`. The label names the state at the end of the run.
+
+    Args:
+        case: The case of the runs.
+        first: Pose at the start of each run, `(n, 7)`.
+        last: Pose at the end of each run, `(n, 7)`.
+    """
     return np.asarray(jax.vmap(case.label)(jnp.asarray(first), jnp.asarray(last)))
 
 
@@ -297,10 +303,12 @@ def difference(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
 
 
 def sides(case: Case, num: int) -> dict[str, np.ndarray]:
-    """Simulate a case on all sides. A side is a way to compute the case, see the docstring of the module.
+    """Compute a case in all ways, such as with MJX and with C MuJoCo, and label the runs by their results.
+
+    These ways are called sides. The docstring of the module describes them.
 
     Args:
-        case: The case.
+        case: The scenario, the objects and the possible labels.
         num: Number of runs on each side.
 
     Returns:
@@ -332,10 +340,13 @@ def sides(case: Case, num: int) -> dict[str, np.ndarray]:
 
 
 def compare(found: dict[str, np.ndarray], labels: Sequence[str], margin: float = MARGIN) -> bool:
-    """Print the share of every label on our side and on each other side, with the interval of the difference.
+    """Print the share of every label on the side "ours" and on each other side, with the interval of the difference.
+
+    A side is one way to compute the same runs, such as another time step or another physics engine. The label of a run
+    states how the run ends, such as "lies".
 
     Args:
-        found: Index of the label of every run, by name of the side. Our side, "ours", must be the first.
+        found: Index of the label of every run, by name of the side. The side "ours" must be the first.
         labels: The labels.
         margin: Limit for the absolute values of both ends of each interval.
 
@@ -359,7 +370,10 @@ def compare(found: dict[str, np.ndarray], labels: Sequence[str], margin: float =
 
 
 def main(args: Args) -> None:
-    """Compare the sides of all cases, or of the one case that `--only` selects."""
+    """Simulate each case on all sides (see the docstring of the module), and print the comparison of the sides.
+
+    With `--only`, a single case is simulated.
+    """
     within = [compare(sides(case, args.num), case.labels) for case in cases() if args.only in (None, case.name)]
     print(f"every interval within {100 * MARGIN:.0f} points: {'yes' if all(within) else 'NO'}")
 

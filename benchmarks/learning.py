@@ -143,10 +143,12 @@ def state_stepper(size: int) -> Callable[[], None]:
 
 
 def state_predictor(num_samples: int) -> Callable[[], None]:
-    """Make a function that predicts from one visual image with a state-space model of random weights.
+    """Make a function without arguments that computes one prediction, to measure its duration.
+
+    The input of the prediction is one visual image. The model is a state-space model with random weights.
 
     Args:
-        num_samples: Number of samples of each prediction.
+        num_samples: Number of samples of the prediction.
     """
     config = statespace.Config()
     graphdef, params, _ = statespace.init(jax.random.key(0), config)
@@ -184,7 +186,7 @@ def state_space() -> None:
 
 
 def main(args: Args) -> None:
-    """Measure the durations of training steps and predictions of the chosen models, and print a line for each."""
+    """Measure how long training steps and predictions of the chosen models take, and print the results."""
     print(f"{jax.devices()[0].device_kind}, {os.cpu_count()} cores")
     if args.only != "statespace":
         paper()

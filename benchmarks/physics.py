@@ -119,7 +119,7 @@ def rod() -> objects.Body:
 
 
 def in_c(items: list[objects.Body], traj: physics.Trajectory, constants: physics.Contact) -> tuple[list, np.ndarray]:
-    """Make the models and initial states with which C MuJoCo simulates the same starts as given trajectories.
+    """Make the model and the initial state with which C MuJoCo can repeat each of the given trajectories.
 
     Args:
         items: The objects.
@@ -147,7 +147,11 @@ def in_c(items: list[objects.Body], traj: physics.Trajectory, constants: physics
 
 
 def speed(num: int) -> None:
-    """Print steps per second of MJX and of C MuJoCo, for drops of a hull of 32 vertices, then of each of 8 objects."""
+    """Print steps per second of MJX and of C MuJoCo, first for a hull of 32 vertices, then for eight objects.
+
+    Args:
+        num: Number of drops of each of the eight objects. The hull is dropped `8 * num` times.
+    """
     compare_speed("one hull of 32 vertices", [rod()], 8 * num)
     compare_speed("eight objects, up to 64 vertices", bodies(objects.CATEGORIES, 8), num)
 
@@ -175,7 +179,7 @@ def compare_speed(name: str, items: list[objects.Body], num: int) -> None:
 
 
 def engines(num: int, chunk: int) -> None:
-    """Print falls per second of both engines of `simulate`, for `num` falls of each of 16 objects.
+    """Measure how many falls per second each engine of `simulate` computes for 16 objects, and print the rates.
 
     Args:
         num: Number of falls of each object.
@@ -334,7 +338,7 @@ def pipeline(count: int) -> None:
 
 
 def first_call(name: str, count: int) -> dict[str, Any]:
-    """Measure the compilation time of `simulate` and count its compilations. This process must be a new process.
+    """Measure the compilation time of `simulate` and count its compilations. Call this function in a new process.
 
     Args:
         name: Name of the scenario, in SCENARIOS.

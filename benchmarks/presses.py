@@ -76,7 +76,7 @@ class Pixels:
 
 
 class Descent(NamedTuple):
-    """The values that `refine` optimises, and the state of the Adam optimiser, between two steps."""
+    """The state of the optimisation in `refine` after a step: the optimised values and the state of Adam."""
 
     unknowns: dict[str, Array]
     optimiser: optax.OptState
@@ -92,7 +92,7 @@ def read() -> Presses:
     path = Path(spec.origin or "").parent / "calib" / "gelsight" / "dataPack.npz" if spec else None
     if path is None or not path.is_file():
         raise FileNotFoundError(
-            "the images of the presses are part of the package taxim 1.4.1. Install it: "
+            "the images of the presses are missing. They are part of the package taxim 1.4.1. Install it: "
             "pip install -e '.[bench]' -c constraints.txt"
         )
     with np.load(path) as pack:
@@ -108,7 +108,7 @@ def held_out(number: int) -> np.ndarray:
 def skin_under_ball(
     centre: Float[np.ndarray, "2"], radius: float, row: np.ndarray, column: np.ndarray, shape: tuple[int, int]
 ) -> tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"]]:
-    """Normals and points of the skin where it lies on the ball.
+    """Compute normals and points of the skin inside its contact with the ball, where the skin is a part of a sphere.
 
     Args:
         centre: Column and row of the contact's centre (pixels).
@@ -181,7 +181,7 @@ def changes(constants: tactile.Phong, lights: tactile.Lights | tactile.Leds, giv
     Args:
         constants: Constants of the reflectance.
         lights: The lights, whose colours are replaced by white.
-        given: The pixels.
+        given: The pixels, with points and normals of the pressed skin.
 
     Returns:
         The change of the image, `(lights, pixels)`.
@@ -220,7 +220,11 @@ def _inverse(value: float | np.ndarray) -> Array:
 
 
 def start(given: Pixels, *, near: bool) -> dict[str, Array]:
-    """Initial unknowns of `shader`, with the lights that least squares selects from rings around the image."""
+    """Initial values of the unknowns of `shader`.
+
+    Non-negative least squares selects the lights from candidates in rings around the image. The fall-off, the specular
+    reflectance and the shininess start from constants.
+    """
     rings = [(r, t) for r in ((14, 20, 35) if near else (20,)) for t in (0.2, 0.5, 1.0, 2.0)]
     angles = 2 * np.pi * np.arange(12) / 12
     rows = [[r * np.cos(a + k), r * np.sin(a + k), _inverse(r * t)] for k, (r, t) in enumerate(rings) for a in angles]
@@ -237,7 +241,11 @@ def start(given: Pixels, *, near: bool) -> dict[str, Array]:
 
 @functools.partial(jax.jit, static_argnames=("near", "steps"))
 def refine(unknowns: dict[str, Array], given: Pixels, *, near: bool, steps: int) -> dict[str, Array]:
-    """Minimise the mean squared error of `draw` over the unknowns of `shader`, by Adam with a cosine schedule."""
+    """Fit the unknowns of `shader` to the colours of pixels.
+
+    Adam with a cosine schedule minimises the mean squared difference between the colours that `draw` computes from the
+    unknowns and the real colours.
+    """
     optimiser = optax.adam(optax.cosine_decay_schedule(RATE, steps))
 
     def loss(unknowns: dict[str, Array]) -> Array:

@@ -37,10 +37,10 @@ class Args:
 
 
 def main(args: Args) -> str:
-    """Draw the picture and return the answers as text.
+    """Draw predicted and true images in one picture, and return the correct matches as text.
 
     Raises:
-        ValueError: `first` is negative, or the held-out list has fewer than ten trajectories from index `first` on.
+        ValueError: `first` is negative, or fewer than ten held-out trajectories have an index of at least `first`.
     """
     if args.first < 0:
         raise ValueError(f"--first must be at least 0, got {args.first}")

@@ -57,7 +57,7 @@ class Point(NamedTuple):
 
 
 def some(part: Part, objects: np.ndarray) -> Part:
-    """Select the items that show one of the given objects."""
+    """Select the items of `part`, such as trajectories or views, whose object number is in `objects`."""
     rows = np.isin(part.object, objects)
     chosen: Part = jax.tree.map(lambda leaf: leaf[rows], part)
     return chosen

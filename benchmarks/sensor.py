@@ -72,7 +72,7 @@ class Args:
     """Options of the command line.
 
     Raises:
-        ValueError: More than one option is given.
+        ValueError: More than one of `taxim`, `cost` and `compile` is True.
     """
 
     taxim: bool = False  # measure tactile images from height maps, compared with taxim
@@ -253,7 +253,11 @@ def cases() -> Iterator[Case]:
 
 
 def measure(case: Case) -> Durations:
-    """Measure `sense` and embree, in one thread and in as many threads as there are cores."""
+    """Measure the seconds per frame of `sense` and of the ray tracer Embree.
+
+    Both are measured in one thread and in as many threads as there are cores. On a GPU, `sense` is measured without
+    threads, for single frames and for a batch.
+    """
     cores, on_cpu = os.cpu_count() or 1, jax.default_backend() == "cpu"
     pool = concurrent.futures.ThreadPoolExecutor(cores)
 
@@ -279,7 +283,7 @@ def measure(case: Case) -> Durations:
 
 
 def rates(case: Case, found: Durations) -> str:
-    """Format a row of the first table: frames per second, and ratios of embree's seconds to those of `sense`."""
+    """Format a row of the first table: frames per second, and embree's seconds divided by the seconds of `sense`."""
     row = [f"{case.name} |"]
     for mine, theirs in ((found.frame, found.embree), (found.at_once, found.embree_at_once)):
         row += [f"{1 / mine:8.1f}  {1 / theirs[0]:6.0f}", *(f"{t / mine:6.2f}" for t in theirs), "|"]
@@ -287,7 +291,11 @@ def rates(case: Case, found: Durations) -> str:
 
 
 def shares(case: Case, found: Durations) -> str:
-    """Format a row of the second table: shares of the stages, and at 640x480 the speed relative to the paper's code."""
+    """Format a row of the second table: the time of `sense` per frame (ms), and each stage's share of this time (%).
+
+    The stages are the balance of the gel, the depth, the visual image and the tactile image. For images of 640x480
+    pixels, the row also has the speed of `sense` relative to the paper's code.
+    """
     stages = [found.gel, found.depth - found.gel, found.visual - found.depth, found.tactile - found.depth]
     line = " ".join(f"{100 * stage / found.frame:9.0f}" for stage in stages)
     paper = f"   {PAPER / found.at_once:.1f} times the paper's" if case.shape == (480, 640) else ""
@@ -356,7 +364,9 @@ def compare_taxim(shape: tuple[int, int] = (480, 640), pitch: float = 0.0295e-3)
 
 
 def cost_of(faces: int, height: int, width: int) -> dict[str, float]:
-    """Measure the cost of a frame of a bottle in this process, which must be a new one.
+    """Measure the time and the peak memory to render a frame of a bottle.
+
+    This function must be called in a new process, because the peak memory includes all earlier work of the process.
 
     Args:
         faces: Approximate number of faces.

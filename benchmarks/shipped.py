@@ -65,10 +65,11 @@ class Args:
 
 
 def collection(args: Args) -> dataset.Collection:
-    """Make the settings of a dataset of the experiment `args.model`, with objects that no model was trained on.
+    """Make the settings of a dataset for the test of `args.model`, with objects that no model was trained on.
 
-    The training split contains a fifth of the objects, which only define the baselines and the frequencies of the
-    outcomes. The test split contains the other objects. The validation split is empty.
+    No model is trained on this dataset either. Its training split contains a fifth of the objects, and only defines the
+    baselines and the frequencies of the outcomes. The test split contains the other objects. The validation split is
+    empty.
     """
     return dataclasses.replace(
         EXPERIMENTS[args.model].COLLECTION,
@@ -83,7 +84,9 @@ def collection(args: Args) -> dataset.Collection:
 
 
 def if_calibrated(confidence: np.ndarray, *, draws: int = DRAWS, seed: int = 0) -> float:
-    """Mean calibration error when the outcomes are drawn from the predicted probabilities.
+    """Compute the mean calibration error that chance alone causes if the predicted probabilities are correct.
+
+    In each draw, the likeliest outcome of each trajectory is the true one with its predicted probability.
 
     Args:
         confidence: Probability of the likeliest outcome of each trajectory, `(n,)`.
@@ -95,7 +98,7 @@ def if_calibrated(confidence: np.ndarray, *, draws: int = DRAWS, seed: int = 0) 
 
 
 def main(args: Args) -> str:
-    """Simulate the trajectories, and return a table of the main metrics and a table of the metrics of the samples.
+    """Test a model on new trajectories, and return a table of the main metrics and a table for sampled predictions.
 
     Raises:
         FileNotFoundError: The folder `--trained` contains no model.
@@ -104,7 +107,8 @@ def main(args: Args) -> str:
     """
     if args.objects < 5:
         raise ValueError(
-            f"--objects must be at least 5, because a fifth of the objects is for the baselines, got {args.objects}"
+            f"--objects must be at least 5, got {args.objects}. A fifth of the objects is for the baselines, and they "
+            "need at least one object"
         )
     sts.enable_compilation_cache()
     scenario = EXPERIMENTS[args.model].COLLECTION.scenario

@@ -138,10 +138,10 @@ def block(name: str, index: int, size: int) -> dict[str, np.ndarray]:
 
 
 def claim(folder: Path, name: str, size: int) -> None:
-    """Write the settings of a scenario's blocks to a folder.
+    """Write the settings with which the trajectories of a scenario are simulated to a JSON file in a folder.
 
     Raises:
-        ValueError: The folder has blocks with other settings. The message names all settings that differ.
+        ValueError: The folder already has such a file with other settings. The message names all settings that differ.
     """
     settings = {"scenario": repr(SCENARIOS[name]), "num": NUM, "block": size, "sunk_limit": SUNK_LIMIT}
     storage.claim(folder / f"{name}.json", settings)
@@ -165,7 +165,7 @@ def soaked(folder: Path, name: str) -> Starts:
     claimed, paths = folder / f"{name}.json", sorted(folder.glob(f"{name}-????.npz"))
     if not (claimed.exists() and paths):
         raise FileNotFoundError(
-            f"{folder} has no blocks of trajectories ({name}.json and {name}-*.npz): make them with "
+            f"{folder} has no stored trajectories ({name}.json and {name}-*.npz): make them with "
             f"python -m benchmarks.soak --keep {folder}"
         )
     claim(folder, name, json.loads(claimed.read_text())["block"])

@@ -27,8 +27,9 @@ class Args:
 
 
 def features(tactile: np.ndarray, blank: np.ndarray) -> np.ndarray:
-    """Compute 11 features of the imprint in each image, from the darkness and the number of its pixels.
+    """Compute 11 features of the imprint in each image, from the number and the darkness of the imprint's pixels.
 
+    The imprint consists of the pixels whose value in any channel differs by more than 3 (of 255) from `blank`.
     The darkness of a pixel in a channel is -log(value / value in `blank`). For each pixel, `most` is its largest
     darkness in a channel, but at least 0, and `mean` is the mean of its darkness over the channels. The features are:
 
@@ -89,7 +90,7 @@ def saturated(tactile: np.ndarray, blank: np.ndarray) -> np.ndarray:
 
 
 def main(args: Args) -> None:
-    """Print the share of the variance that the regression explains, and the share of saturated pixels."""
+    """Fit a regression of the mass to tactile images. Print its R2 and error, and the share of saturated pixels."""
     data = dataset.load(args.dataset)
     collection = dataset.Collection(num_objects=data.collection["num_objects"], seed=data.collection["seed"])
     bodies = dataset.make_bodies(collection, np.arange(collection.num_objects))

@@ -59,7 +59,10 @@ class Config:
 
     @property
     def board(self) -> hardware.Board:
-        """Calibration board with its printed sizes, which are the nominal sizes times `ruler` / 100 mm."""
+        """Calibration board with the sizes of its print: the nominal sizes times `ruler` / 100.
+
+        `ruler` is the measured length of the ruler on the printed page (mm). It is 100 if the printer does not scale.
+        """
         scale, nominal = self.ruler / 100, hardware.Board()
         return dataclasses.replace(nominal, square=scale * nominal.square, marker=scale * nominal.marker)
 
@@ -128,7 +131,7 @@ def find(config: Config) -> str:
 
 @contextlib.contextmanager
 def opened(config: Config) -> Iterator[tuple[hardware.Camera, hardware.Leds]]:
-    """Open the camera and the LED controller, and close them afterwards. The lights are off at first."""
+    """Open the camera and the LED controller, and close them after the `with` block. The lights are off at first."""
     assert config.camera is not None
     assert config.leds is not None
     source = hardware.CameraConfig(
@@ -178,7 +181,9 @@ def expose(config: Config, camera: hardware.Camera, leds: hardware.Leds) -> tupl
 
 
 def ideal(config: Config, pinhole: hardware.Pinhole) -> hardware.Lens:
-    """Make a lens without error that has the field of view of the option `--ideal-lens`.
+    """Make an ideal lens with the field of view of the option `--ideal-lens`, instead of a calibrated lens.
+
+    An ideal lens is equidistant, and its optical axis is perpendicular to the pad and meets the centre of the pad.
 
     Raises:
         CalibrationError: The raw image of this lens does not contain the whole view of the sensor. The view is the part
@@ -271,7 +276,10 @@ def claim_pictures(config: Config, camera: hardware.Camera) -> None:
 
 
 def main(config: Config) -> None:
-    """Commission the sensor, or only write the calibration board or list the devices, as the options require."""
+    """Measure the camera, the lights and the lens of a sensor, and write the sensor file.
+
+    With `print_board`, only write the calibration board. Without `camera` or `leds`, only list the devices.
+    """
     if config.print_board is not None:
         hardware.save_board(config.print_board)
         print(f"{config.print_board}: print it at 100 % on A4. The ruler on the page must measure 100 mm")

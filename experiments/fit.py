@@ -196,7 +196,7 @@ def errors(at: np.ndarray) -> tuple[float, float]:
 
 
 def draw(config: Config, target: np.ndarray, paths: list[list[tuple[np.ndarray, Slope]]]) -> None:
-    """Draw the target, the start and the end of the first fit, their differences from the target, and all paths."""
+    """Draw the first fit (target, start, end, start minus target, end minus target) and the paths of all fits."""
     (_, first), (_, last) = paths[0][0], paths[0][-1]
     flat = np.median(target, axis=(0, 1))
     touched = np.abs(np.stack([target, first.image]) - flat).max(axis=(0, -1)) > SEEN

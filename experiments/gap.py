@@ -134,13 +134,13 @@ def simulated_dataset(folder: Path, resolution: tuple[int, int] | None) -> Side:
 
 
 def side(visual: np.ndarray, tactile: np.ndarray, numbers: np.ndarray, described: str) -> Side:
-    """Make a `Side` from the images of n trajectories.
+    """Make a `Side`, which holds either the real or the simulated images, from the images of n trajectories.
 
     Args:
         visual: Initial and final visual images, shape (n, 2, height, width, 3).
         tactile: Initial and final tactile images, of the same shape.
         numbers: Numbers of the n trajectories.
-        described: Description of the source.
+        described: Description of the source of the images, such as their folder.
     """
     visual, tactile = (leaf.reshape(-1, *leaf.shape[2:]) for leaf in (visual, tactile))
     return Side(gap.Streams(visual, tactile, np.repeat(numbers, 2)), f"{described}, {len(numbers)} trajectories")

@@ -219,7 +219,7 @@ class Screen:
         self.live: Live | None = None
 
     def add(self, shot: hardware.Shot) -> None:
-        """Show a new image."""
+        """Process a new image: update the page or the terminal, and the file of `--save`."""
         self._shown = {**self._shown, shot.stream: (self._views.shown(shot.image), shot.time_s)}
         self._arrived_s.append(shot.time_s)
         if self._recorded is not None:

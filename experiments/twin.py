@@ -57,7 +57,7 @@ class Config:
 
 
 def make(config: Config) -> twin.Twin:
-    """Make the twin, and render the empty pad and the first held pose.
+    """Make the twin (a simulated sensor), and render the empty pad and the first pose of the object in advance.
 
     Raises:
         ValueError: An option is out of range.

@@ -1,4 +1,4 @@
-"""Check of a random key."""
+"""`check_key`, which checks that an argument is a random key of JAX."""
 
 from typing import Any
 

@@ -76,7 +76,7 @@ def remedy(error: Exception) -> str:
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write bytes to a file atomically. Errors are those of `write_whole`."""
+    """Write bytes to a file atomically. The function raises the same errors as `write_whole`."""
 
     def write(temporary: Path) -> None:
         temporary.write_bytes(data)
@@ -85,7 +85,11 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write an object of JSON types to a JSON file atomically. Errors are those of `write_whole`."""
+    """Write an object, such as a dictionary or a list, to a JSON file atomically.
+
+    Raises:
+        OSError: The file cannot be written. The message names the file and the remedy.
+    """
     write_bytes(path, (json.dumps(content, indent=2) + "\n").encode())
 
 
@@ -184,8 +188,8 @@ def read_arrays(path: Path, remedy: str) -> dict[str, np.ndarray]:
 def claim(path: Path, content: dict, *, labels: tuple[str, ...] = ()) -> None:
     """Record settings in a JSON file, or check that an existing file has the same settings.
 
-    The check ensures that all results in a folder have the same settings. The existing file may lack a field if the new
-    value is an empty list or dictionary, or if `labels` contains the name of the field.
+    The check ensures that all results in a folder have the same settings. A field may be missing from the existing file
+    if its value in `content` is an empty list or dictionary, or if `labels` contains its name.
 
     Args:
         path: The file.

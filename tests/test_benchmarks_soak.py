@@ -40,7 +40,7 @@ def test_soaked_reads_all_kept_blocks_in_order(tmp_path):
     starts = soak.soaked(tmp_path, "inclined")
     np.testing.assert_array_equal(starts.pose, np.concatenate([b["pose"] for b in blocks]))
     assert set(starts.rerolled) == {-1}
-    with pytest.raises(FileNotFoundError, match=r"no blocks of trajectories \(freefall\.json"):
+    with pytest.raises(FileNotFoundError, match=r"no stored trajectories \(freefall\.json"):
         soak.soaked(tmp_path, "freefall")
 
 

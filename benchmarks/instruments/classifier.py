@@ -65,7 +65,10 @@ def mean(values: np.ndarray, weight: np.ndarray) -> float:
 
 
 def gain(before: np.ndarray, after: np.ndarray, weight: np.ndarray) -> float:
-    """Relative decrease of the weighted mean loss, `1 - mean(after) / mean(before)`, from losses `(n,)` each."""
+    """Relative decrease of the weighted mean loss, `1 - mean(after) / mean(before)`.
+
+    The arrays `before` and `after` are losses, `(n,)` each.
+    """
     return 1 - mean(after, weight) / mean(before, weight)
 
 

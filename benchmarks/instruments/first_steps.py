@@ -7,7 +7,7 @@ CLASS = "scissors"
 
 
 def stamps() -> dict[str, float]:
-    """Time the first steps of a new user, such as the imports, the first image, a gradient and 64 falls.
+    """Time the first steps of a new user, such as the imports, the first image, a gradient and 64 simulated falls.
 
     The imports stand inside the function, because they are the first step.
 

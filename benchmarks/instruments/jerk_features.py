@@ -28,7 +28,12 @@ class Sight(NamedTuple):
 
 
 def look(body: objects.Body) -> tuple[np.ndarray, float, np.ndarray]:
-    """Compute the row of `Sight` for one object."""
+    """Compute the row of one object in each field of `Sight`.
+
+    Returns:
+        Profile (radii and height), height of the lowest point in the mesh frame, and mass properties at each fill
+        level. `Sight` gives their shapes and units.
+    """
     points = np.asarray(body.vertices)[np.unique(np.asarray(body.faces))]
     low = float(points[:, 2].min())
     radius, level = np.hypot(points[:, 0], points[:, 1]), (points[:, 2] - low).round(5)
@@ -41,7 +46,7 @@ def look(body: objects.Body) -> tuple[np.ndarray, float, np.ndarray]:
 
 
 def sight(items: list[objects.Body]) -> Sight:
-    """Compute the visible properties of all objects."""
+    """Compute properties that follow from the visible shapes of objects, such as the mass at each fill level."""
     return Sight(*map(np.stack, zip(*map(look, items), strict=True)))
 
 

@@ -88,7 +88,7 @@ class Peer:
         self.path.unlink(missing_ok=True)
 
     def send(self, data: bytes) -> None:
-        """Send bytes to the host. They are lost if the host reads nothing or the controller has vanished."""
+        """Send bytes to the host. The bytes are lost if the port's buffer is full or the controller is unplugged."""
         with contextlib.suppress(OSError):
             os.write(self._master, data)
 

@@ -25,7 +25,7 @@ CORNER = 32  # pixels, side of the corner that shows the number
 
 
 class Lights:
-    """The light of the plugged-in controller over time, as a share of the full power."""
+    """A log of the light level of the emulated sensor over time, as a share of the full power."""
 
     def __init__(self) -> None:
         self._changes = [(0.0, 0.0)]  # each change: its time (s) and the share of the light from then on
@@ -58,9 +58,9 @@ class Lights:
         return found, mean
 
     def off_after(self, time_s: float) -> float | None:
-        """Return the time at which the lights went off, or `time_s` if they went off earlier. None: they are on now.
+        """Return None if the lights are on now. Otherwise, return `max(time_s, t)`, where t is the time they went off.
 
-        Both times are in seconds on `time.monotonic`.
+        All times are in seconds on `time.monotonic`.
         """
         with self._lock:
             since_s, share = self._changes[-1]
@@ -180,7 +180,8 @@ class SensorPeer:
     def plug_in(self, path: Path) -> None:
         """Plug the controller in at the port `path`, so that the controller boots.
 
-        The controller's watchdog runs at the true speed. By default, the clock of `Peer` is a hundred times slower.
+        The clock of this controller runs at the true speed, so its watchdog acts after the requested period. The
+        default clock of `Peer` is a hundred times slower.
         """
         self._boots += 1
         self.leds = Peer(path, clock=time.monotonic, make=functools.partial(SeenController, self.lights))
@@ -192,9 +193,11 @@ class SensorPeer:
         self.lights.changed(protocol.DARK)
 
     def judged(self, image: Image, *, lit: bool) -> bool:
-        """Return whether the lights were at full power (`lit=True`) or off (`lit=False`) for an image's whole exposure.
+        """Return whether the lights had the given state during the whole exposure of an image.
 
-        Return False for images that the camera did not take.
+        Args:
+            image: Image from the emulated camera. The result is False if the camera's log has no exposure for it.
+            lit: True for lights at full power, False for lights that are off.
         """
         found = self.camera.exposure_of(image)
         return found is not None and found.shares == [1.0 if lit else 0.0]

@@ -14,5 +14,5 @@ class Shown(NamedTuple):
     light: float  # mean light during the exposure, as a share of the full power
 
     def is_of(self, share: float) -> bool:
-        """Return whether the mean light during the exposure was this share of the full power, within 0.001."""
+        """Return True if the mean light differs from `share` (of the lights' full power) by at most 0.001."""
         return abs(self.light - share) <= _TOLERANCE

@@ -157,6 +157,8 @@ def draw(items: list[objects.Body], starts: Starts) -> tuple[np.ndarray, np.ndar
 def kept(folder: Path | None, name: str, make: Callable[[], Starts]) -> Starts:
     """Load starts from a file. If the file does not exist, make the starts and write the file.
 
+    Starts are the initial states of trajectories, which are stored together with the outcomes.
+
     Args:
         folder: Folder of the file. None: make the starts and write nothing.
         name: Name of the file, without `.npz`.

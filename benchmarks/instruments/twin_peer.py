@@ -58,7 +58,7 @@ class TwinPeer:
         self.url = self._served.camera
 
     def move(self) -> None:
-        """Release the object if it is held, or hold it in its next pose."""
+        """Release a held object. If no object is held, hold the object in its next pose."""
         self.twin.command("release" if self.twin.state.phase == twin.Phase.HELD else "hold")
 
     def stop(self) -> None:
@@ -67,7 +67,11 @@ class TwinPeer:
         self.twin.close()
 
     def shown(self) -> dict[int, Shown]:
-        """Return the light of each frame from the log: a dictionary from the image's checksum to its `Shown`."""
+        """Return the number of each frame in the twin's log, and the mean light during its exposure.
+
+        Returns:
+            A dictionary with one entry per frame. The key is the checksum of the image (from the function `key`).
+        """
         _, *parts = self._record.read_bytes().split(_START)
         frames = zip(parts, twin.read_log(self._log), strict=True)
         return {key(photometry.decode(_START + part)): Shown(frame.index, frame.light) for part, frame in frames}

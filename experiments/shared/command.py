@@ -90,7 +90,8 @@ def run(presets: Mapping[str, Config], workdir: str, description: str | None) ->
 def parse(presets: Mapping[str, Config], workdir: str, description: str | None) -> Args:
     """Read the options of the command line.
 
-    A field of the configuration keeps the value of the preset if its option is not given.
+    The option `--preset` selects one of the presets. Without it, the preset is `default`. Other options can replace
+    single fields of this preset.
 
     Args:
         presets: Configurations by name. The name `default` must be among them.

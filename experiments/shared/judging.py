@@ -134,8 +134,8 @@ def _check_measurements(folder: Path, own: Extensions) -> None:
     given = sorted(measurement.name for measurement in own.measurements)
     if given != trained:
         raise ValueError(
-            f"measurements has {given}, but the model in {folder} was trained with {trained}: evaluate it with "
-            "Extensions(measurements=...) of the training, or train it again in a new work directory"
+            f"measurements has {given}, but the model in {folder} was trained with {trained}: pass the same "
+            "Extensions(measurements=...) as for the training, or train the model again in a new work directory"
         )
 
 

@@ -1,4 +1,4 @@
-"""Predicts the resting state from live images in a thread. A model that is slower than the sensor skips images."""
+"""A thread that predicts images of the resting object from live images. A slow model skips some live images."""
 
 import collections
 import dataclasses
@@ -29,7 +29,7 @@ Image = UInt8[np.ndarray, "height width 3"]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Predicted:
-    """A prediction, and facts about the images from which it was made."""
+    """A prediction of the resting state, and facts about the input images, such as whether they show a contact."""
 
     visual: Image  # predicted visual image at rest, the mean over the model's samples
     tactile: Image  # predicted tactile image at rest
@@ -75,7 +75,15 @@ class Views:
         return hardware.rectified(self.lens, self.pinhole, image, (SIDE, SIDE))
 
     def floats(self, image: Image, resolution: tuple[int, int]) -> Float[np.ndarray, "height width 3"]:
-        """Rectify and crop a raw image to the sensor's pad, with the resolution (height, width), float32 in [0, 1]."""
+        """Rectify a raw image, and crop it to the sensor's pad.
+
+        Args:
+            image: Raw image, uint8 RGB.
+            resolution: Height and width of the result (pixels).
+
+        Returns:
+            Rectified image, float32 RGB in [0, 1].
+        """
         return hardware.rectified(self.lens, self.pinhole, image, resolution).astype(np.float32) / 255
 
     def prepared(self, visual: Image, tactile: Image, empty: Mapping[str, np.ndarray]) -> hardware.SensorView:
@@ -104,9 +112,9 @@ class Live:
     """Predicts the resting state in a background thread, always from the newest images.
 
     ```python
-    with Live(predictor, views, (), show) as live:
-        live.offer(visual, tactile)
-        live.newest
+    with Live(predictor, views, condition=(), show=update_page) as live:
+        live.offer(visual, tactile)  # the newest two images
+        live.newest  # the newest prediction, or None before the first one
     ```
     """
 
@@ -132,7 +140,9 @@ class Live:
             ValueError: The model cannot use visual images, or `condition` has the wrong length.
         """
         if "visual" not in predictor.modalities:
-            raise ValueError(f"the model {predictor!r} takes no visual images as inputs: give another --model")
+            raise ValueError(
+                f"the model takes no visual images as inputs: give another --model. The model is {predictor!r}"
+            )
         width = predictor.model.config.condition
         if len(condition) not in (0, width):
             raise ValueError(

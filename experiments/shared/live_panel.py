@@ -94,7 +94,7 @@ class PanelFile:
         self._next_s = -float("inf")  # time at which the next panel is due (s)
 
     def add(self, seen: Seen) -> None:
-        """Draw a panel and add it to the video or picture, if a panel is due.
+        """If a panel is due, draw it and add it to the video or picture. A panel is an image of the display.
 
         A panel is due every 0.1 s for a video, and every second for a picture. Nothing is drawn while `seen.rate`
         (predictions per second) is 0. `close` writes the picture.

@@ -177,7 +177,7 @@ def sensor_file(workdir: Path) -> tuple[hardware.Device, sts.Sensor]:
 def identity(workdir: Path, recordings: hardware.Recordings) -> str:
     """The checksum of the trajectories and the sensor file.
 
-    The sensor file contains the checksums of the background images.
+    The checksum also depends on the background images, because the sensor file contains their checksums.
     """
     return storage.digest({"dataset": recordings.identity, "sensor": storage.sha256(workdir / "sensor.json")})
 

@@ -1,4 +1,4 @@
-"""Records the checksums of the inputs and outputs of results, and checks if the results are up to date."""
+"""Writes results with the checksums of their inputs and output files, and checks if the results are up to date."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -50,7 +50,7 @@ class Simulated:
 
 
 class Hand(twin.Hand):
-    """Moves the twin's object as `hardware.collect` instructs, and shows the progress of the collection."""
+    """Moves the object on a simulated sensor as `hardware.collect` instructs, and shows the collection's progress."""
 
     def __init__(self, device: twin.Twin, session: hardware.Session, bar: Bar, count: int):
         super().__init__(device, session)
@@ -143,11 +143,11 @@ def started(config: Simulated, first: int) -> Iterator[twin.Twin]:
 
 
 def commissioned(config: Simulated, device: twin.Twin) -> tuple[twin.VirtualSensor, EmptyPad]:
-    """Make the objects that read images of the twin and describe its empty pad, from the sensor file.
+    """Make the `VirtualSensor` that reads images of the twin, and the `EmptyPad` that describes its empty pad.
 
-    If the work directory has no sensor file, `commission` writes it first. The `VirtualSensor` gets the settling times
-    of the file, which are the waiting times after the LEDs are switched. The `EmptyPad` is computed from the background
-    images that the file names.
+    Both are made from the sensor file. If the work directory has no sensor file, `commission` writes it first. The
+    `VirtualSensor` gets the settling times of the file, which are the waiting times after the LEDs are switched. The
+    `EmptyPad` is computed from the background images that the file names.
 
     Raises:
         ValueError: The sensor file was written with another image size or with other LED levels.
@@ -170,7 +170,7 @@ def commissioned(config: Simulated, device: twin.Twin) -> tuple[twin.VirtualSens
 
 
 def commission(config: Simulated, device: twin.Twin) -> None:
-    """Measure the settling times of the twin's LEDs, record images of its empty pad, and write the sensor file."""
+    """Measure the LED settling times of the simulated sensor, record its empty pad, and write its sensor file."""
     simulated = sts.Sensor()
     sensor = twin.VirtualSensor(device, levels=config.levels)
     recorded = backgrounds.record(sensor)

@@ -76,7 +76,7 @@ class Site(abc.ABC):
     def image(self, stream: str) -> Image | None:
         """The newest image of a stream, or None before the first image.
 
-        If the image has not changed, the same object is returned again.
+        Until a newer image arrives, each call returns the same object.
         """
 
     def still(self, path: str) -> Image | None:

@@ -55,7 +55,7 @@ def main(config: Config, workdir: Path, *, only: Stage | None = None, own: Exten
 
 
 def claim(config: Config, workdir: Path) -> None:
-    """Write `config.json`, or check that an existing file has the same content.
+    """Write the configuration to `config.json`. If this file exists, check that it has the same configuration.
 
     Raises:
         ValueError: The work directory has another configuration. The message names the fields that differ.

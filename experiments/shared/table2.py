@@ -1,4 +1,4 @@
-"""Evaluates the models of Table 2, and writes the table and a figure of predictions."""
+"""Evaluates the models of the paper's Table 2, and writes the table and a figure of predictions."""
 
 import dataclasses
 from collections.abc import Mapping

@@ -19,7 +19,7 @@ TITLE = "state-space model, simulated training"
 
 
 def predictions(config: Config, data: Recorded, workdir: Path) -> Predicted | None:
-    """Predict the last frames of the validation trajectories from visual and tactile images of the held objects.
+    """Predict the last frames of the validation trajectories from their initial visual and tactile images.
 
     The brightness and the colours of the images are first adapted to the model's training images (`hardware.relit`).
     The brightness and the colours of the predictions are then adapted back to the recorded images.

@@ -30,7 +30,7 @@ from sts_jax.storage import claim, digest, lock, read_json
 
 
 class Collected(NamedTuple):
-    """The result of `collect`: how many trajectories were sampled again, and which objects the dataset lacks."""
+    """The result of `collect`: how many failed trajectories were sampled again, and which objects the dataset lacks."""
 
     resampled: int  # number of trajectories that were discarded and sampled again
     left_out: tuple[str, ...]  # one line for each object that the dataset lacks, with the reason

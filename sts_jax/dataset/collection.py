@@ -1,4 +1,4 @@
-"""The description of a dataset, `Collection`, and functions that make its objects, their classes and their split."""
+"""`Collection`, the description of a dataset, and functions that return the dataset's objects, classes and split."""
 
 import dataclasses
 import math

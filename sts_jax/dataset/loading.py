@@ -233,7 +233,9 @@ class Dataset:
         return self.split[part]
 
     def ends(self, trajectories: np.ndarray) -> Ends:
-        """Return the first and last poses of trajectories. Trajectories without images are allowed.
+        """Return the first and last poses, conditions and outcomes of trajectories, and the masses of their objects.
+
+        Trajectories without images are allowed.
 
         Args:
             trajectories: Indices of the trajectories, int `(n,)`.

@@ -1,4 +1,4 @@
-"""Specifications of further modalities, in addition to the two images and the pose."""
+"""Specifications of further modalities, such as the contact force, besides the visual image, tactile image and pose."""
 
 import dataclasses
 from collections.abc import Callable, Sequence

@@ -1,4 +1,4 @@
-"""Rendering of the images of a dataset on all CPU cores, as `uint8` arrays and bool segmentations."""
+"""Rendering of a dataset on all CPU cores: images as `uint8` arrays, and segmentations as bool arrays."""
 
 import concurrent.futures
 import functools

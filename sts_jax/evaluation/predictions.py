@@ -21,7 +21,8 @@ class Predicted(NamedTuple):
     """The predicted last frames of n trajectories. Quantities that are not predicted are None.
 
     A prediction is a single frame, or a distribution that is given by k samples. In the second case, `visual` and
-    `tactile` are the means of the samples, and `pose` is a pose at the centre of the distribution.
+    `tactile` are the means of the samples. The position in `pose` is the geometric median of the samples, and the
+    orientation in `pose` is that of a sample near the centre of the distribution.
     """
 
     visual: np.ndarray | None = None  # visual images, (n, height, width, 3), float in [0, 1] or uint8
@@ -178,7 +179,7 @@ def predict(
     Args:
         predictor: The model.
         inputs: Names of the inputs, some of `predictor.modalities`. Models that accept the true pose, shape and mass
-            also have the input `state`. An empty list predicts without any measurement.
+            also have the input `state`. If the list is empty, the model predicts without inputs.
         test: The held-out trajectories, with images of the resolution that the model expects.
         scenario: The scenario of the trajectories.
         validation: Trajectories for choosing the threshold that separates images with and without an object.
@@ -189,7 +190,8 @@ def predict(
         The predictions for all trajectories of `test`.
 
     Raises:
-        ValueError: `test` has no trajectories, or `test` or `validation` lacks a further modality in `inputs`.
+        ValueError: `test` has no trajectories, or `inputs` has the name of a measurement (`dataset.Measurement`) that
+            `test` or `validation` lacks.
     """
     names = tuple(inputs)
     if len(test.object) == 0:

@@ -1,4 +1,4 @@
-"""Errors of predictions of the last frame. An item is one held-out trajectory."""
+"""Errors of predictions of the last frames of held-out trajectories, which are called items."""
 
 import enum
 import functools

@@ -1,4 +1,4 @@
-"""Pictures of an object and the pad from outside."""
+"""Renders an object and the sensor's pad as seen from outside the sensor, obliquely from above."""
 
 import functools
 

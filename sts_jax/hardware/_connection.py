@@ -81,7 +81,7 @@ class Connection:
             timeout_s: Longest wait for the answer, including all repetitions (s).
 
         Returns:
-            The answer, the time just before the request was first sent, and the time at which the answer had arrived.
+            The answer, the time just before the request was first sent, and the time just after the answer arrived.
             Both times are in seconds on the clock `time.monotonic`.
 
         Raises:

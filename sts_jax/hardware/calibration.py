@@ -248,7 +248,8 @@ def _common_size(images: Sequence[NDArray[np.uint8]]) -> tuple[int, int]:
     if len(sizes) > 1:
         names = ", ".join(f"{w}x{h}" for h, w in sorted(sizes))
         raise ValueError(
-            f"all images must have the same size, got {names} pixels. Take all images with the same camera settings."
+            f"all images must have the same size, got the sizes {names} (width x height in pixels). Take all images "
+            "with the same camera settings."
         )
     height, width = images[0].shape[:2]
     return height, width

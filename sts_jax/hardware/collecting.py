@@ -72,7 +72,7 @@ class Person(Protocol):
     """
 
     def show(self, view: View) -> None:
-        """Show the current view.
+        """Show the newest images, the instruction and the state of the recording to the person.
 
         `collect` calls this method after each attempt to read a visual and a tactile image.
         """

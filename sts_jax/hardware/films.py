@@ -44,7 +44,7 @@ class Still(NamedTuple):
 
 
 class Film(abc.ABC):
-    """Recorded images in the order of their times."""
+    """Base class for reading the images of a recording, which are numbered in the order of their times."""
 
     stills: tuple[Still, ...]  # descriptions of the images, in the order of their times
 

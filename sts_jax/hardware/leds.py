@@ -1,6 +1,6 @@
 """Control of the sensor's lights through its LED controller.
 
-`Lit.unchanged_since` compares two answers of the controller, and returns whether the lights changed between them.
+`Lit.unchanged_since` compares two answers of the controller, and returns True if the lights did not change in between.
 """
 
 import contextlib
@@ -277,7 +277,7 @@ class Leds:
             if time.monotonic() + wait > deadline:
                 raise ports.DisconnectedError(
                     f"LED controller {self.serial_number} was not found within {limit_s:g} s. Check its cable. "
-                    "Ports tried: " + ", ".join(f"{name} ({result})" for name, result in tried.items())
+                    "Ports tried: " + (", ".join(f"{name} ({result})" for name, result in tried.items()) or "none")
                 )
             time.sleep(wait)
             wait = min(2 * wait, _LONGEST_WAIT_S)

@@ -26,7 +26,7 @@ DARK: Levels = (0, 0, 0, 0)
 
 
 class Code(enum.IntEnum):
-    """The controller's reason for refusing a request."""
+    """Reason why the LED controller refused a request, such as a damaged line or an unknown command."""
 
     CHECKSUM = 1  # the line is damaged
     COMMAND = 2  # there is no such command

@@ -491,10 +491,10 @@ def read_trajectory(folder: Path, number: int) -> RecordedTrajectory:
 
 
 def read_pair(path: Path, number: int, checksum: str | None = None) -> Pair:
-    """Read a pair of images, and compare their checksums with those in `pair.json`.
+    """Read a visual and a tactile image, and compare their checksums with those in `pair.json`.
 
     Args:
-        path: Folder of the pair, which contains `pair.json`.
+        path: Folder that contains the two images and `pair.json`.
         number: Number of the trajectory, for error messages.
         checksum: Expected SHA-256 of `pair.json`. None: not compared.
 

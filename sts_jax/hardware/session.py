@@ -178,8 +178,8 @@ class Session:
         """Raise an error unless the session can accept a whole trajectory now.
 
         Raises:
-            SessionError: The last attempt to write failed, or more than 3 changes are not on disk yet, or the disk has
-                too little free space.
+            SessionError: The last attempt to write failed, or more than 3 changes (image pairs, confirmations and
+                discards) are not on disk yet, or the disk has too little free space.
         """
         if (problem := self.problem) is not None:
             raise SessionError(

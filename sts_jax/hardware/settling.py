@@ -81,8 +81,9 @@ def check_contrast(contrast: float) -> None:
     """
     if contrast < _LEAST_CONTRAST:
         raise NoContrastError(
-            f"the image changes by {contrast:.2f} of 255 on average between lights off and on, but it must change by "
-            f"at least {_LEAST_CONTRAST:g}: check the LEDs' wiring and levels, and lock the camera's exposure."
+            f"the images with the lights off and on differ by {contrast:.2f} on average (pixel values are 0 to 255), "
+            f"but they must differ by at least {_LEAST_CONTRAST:g}: check the LEDs' wiring and levels, and lock the "
+            "camera's exposure."
         )
 
 

@@ -88,7 +88,10 @@ def read_image(path: Path) -> Image.Image:
 
 
 class Resolver(trimesh.resolvers.FilePathResolver):
-    """Reads the files to which a mesh file refers, for trimesh. It also looks for images in the folder `images`."""
+    """Gives trimesh the content of the files to which a mesh file refers.
+
+    A file is looked up at its path relative to the mesh file, and then by its base name in the folder `images`.
+    """
 
     def __init__(self, path: Path, images: Path) -> None:
         super().__init__(str(path))

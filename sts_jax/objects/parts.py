@@ -110,10 +110,11 @@ def surface_gaps(
 ) -> tuple[float, float]:
     """Compute the largest distances between a visible surface and its collision parts.
 
-    The function computes the distances of sample points. These are the corners of all triangles, 10,000 other points of
-    the visible surface and 10,000 other points of the parts. The distance of each sample point is exact, but the true
-    maximum can lie between the sample points. A returned value can therefore be too small by up to about half the
-    distance between neighbouring sample points. For a single hull, the first returned value is exact.
+    The distances are computed at sample points. The sample points are the vertices of the surface and of the parts,
+    10,000 further points of the surface, and 10,000 further points of the parts. The distance of each sample point is
+    exact, but the true maximum can lie between the sample points. A returned value can therefore be too small by up to
+    about half the distance between neighbouring sample points. If there is only one part, the first returned value is
+    exact.
 
     Args:
         vertices: Vertices of the visible surface (m).
@@ -124,7 +125,8 @@ def surface_gaps(
         Largest distance (m) by which the surface lies outside all parts, and largest distance (m) by which the parts
         lie outside the surface. The visible surface can sink into the pad by the first distance. A contact can lie
         outside the visible surface by up to the second distance, such as in the hollow of a bowl. If the visible
-        surface is not closed, the second distance is measured on both of its sides.
+        surface is not closed, it has no outside. The second distance is then the largest distance between any point of
+        the parts and the surface.
     """
     points = np.concatenate([np.unique(vertices[faces].reshape(-1, 3), axis=0), _points(vertices[faces], 10_000)])
     shapes = [ConvexHull(hull) for hull in hulls]

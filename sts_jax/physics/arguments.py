@@ -126,8 +126,8 @@ def check_hidden(hidden: Hidden, count: int) -> Hidden:
     """Check the hidden properties that a caller passes to `simulate`, and return them as JAX arrays.
 
     Args:
-        hidden: Friction, mass of the shell, and contents, for each of n trajectories. The field `up` has the shape
-            (n, 3), and the other fields have the shape (n,).
+        hidden: Hidden properties of n trajectories. The fields `fill`, `shell_scale` and `friction` have the shape
+            (n,). The field `up` has the shape (n, 3) and contains unit vectors in the mesh frame.
         count: Number n of trajectories.
 
     Raises:

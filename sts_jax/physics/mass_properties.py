@@ -33,7 +33,7 @@ class Rigid(NamedTuple):
 def rigids(bodies: Sequence[Body], which: Int[np.ndarray, "n"], hidden: Hidden) -> Rigid:
     """Compute mass, centre of mass, inertia and friction of bodies with given hidden properties.
 
-    `objects.rigid` has the equations.
+    Hidden properties are those that a camera cannot see, such as the fill level. The equations are in `objects.rigid`.
 
     Args:
         bodies: All bodies.

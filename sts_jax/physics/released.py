@@ -99,7 +99,7 @@ class Released(Scenario):
             raise ValueError(f"scenario.tries is {self.tries}, but it must be >= 1")
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-        """Draw one held pose and the share of the weight that the pad carries.
+        """Draw the pose in which the object is held, and the share of the object's weight that the pad carries.
 
         See `Scenario.start` for the arguments.
 
@@ -151,10 +151,10 @@ class Released(Scenario):
         - `TOPPLES`, if it has turned by more than 45 degrees (turns about the vertical do not count),
         - `RETURNS`, in all other cases.
 
-        The limit of 45 degrees suits most poses from `start`. In these poses, the object touches the pad with the edge
-        between two of its faces, and the narrower face is at less than 45 degrees to the pad. If the two faces are
-        perpendicular, the object turns by less than 45 degrees until it rests on the narrower face, or by more than 45
-        degrees until it rests on the wider face.
+        The limit of 45 degrees suits most poses from `start`. In these poses, the object stands on the edge between two
+        of its faces, and the angle a between the narrower face and the pad is less than 45 degrees. If the two faces
+        are perpendicular, the object turns by a if it returns to the narrower face, and by 90 degrees - a, which is
+        more than 45 degrees, if it topples onto the wider face.
         """
         before, after = (geometry.quat_to_matrix(geometry.normalize(pose[3:]))[2] for pose in (first, last))
         stays = jnp.where(before @ after < math.cos(TURNED), Outcome.TOPPLES, Outcome.RETURNS)

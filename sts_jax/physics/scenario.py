@@ -97,9 +97,10 @@ class Start(NamedTuple):
 
 
 class Quantity(NamedTuple):
-    """A quantity that a scenario draws and that predictors receive, such as the acceleration of the pad.
+    """Description of a known quantity of trajectories, such as the acceleration of the pad.
 
-    The quantity is a number, or a vector (x, y) in the plane of the pad.
+    The scenario samples the value for each trajectory, and predictors receive this value as an input. The value is a
+    number, or a vector (x, y) in the plane of the pad.
     """
 
     name: str  # Name in texts and figures.
@@ -390,7 +391,7 @@ def variant(scenario: _AnyScenario, name: str) -> _AnyScenario:
     lacking = sorted(set(changes[name]) - {field.name for field in dataclasses.fields(scenario)})
     if lacking:
         raise ValueError(
-            f"the variant {name!r} changes fields that the scenario {scenario} lacks: "
+            f"the variant {name!r} changes fields that the scenario {type(scenario).__name__} lacks: "
             f"declare {', '.join(lacking)} in the scenario's dataclass"
         )
     return dataclasses.replace(scenario, **changes[name])

@@ -42,10 +42,10 @@ def weights(
 def weighted(
     corners: Corners, winner: Int[Array, "h w"], column: Float[Array, "h w"], row: Float[Array, "h w"]
 ) -> list[Float[Array, "h w"]]:
-    """For each pixel, multiply `corners.value` at the three corners of the visible face by the corners' weights.
+    """For each pixel, multiply `corners.value` at the three corners of the visible face by barycentric weights.
 
-    The result is a list of the three products. The caller can add them to interpolate the value at the pixel. The
-    arguments are those of the function `weights`.
+    The result is a list of the three products. Their sum is the interpolated value at the pixel. The function `weights`
+    describes the arguments.
     """
     indices, shares = weights(corners, winner, column, row)
     return [share * corners.value[k] for share, k in zip(shares, indices, strict=True)]

@@ -1,6 +1,7 @@
-"""The second compiled program of `sense`: it draws the visual, tactile and depth images of an object in balance.
+"""The second of the two compiled programs of `sense`: it draws the visual, tactile and depth images of an object.
 
-The program is compiled again for each new resolution.
+The first program (`rendering.equilibrium`) computes the pose in which the object and the gel are in balance. The second
+program is compiled again for each new resolution.
 """
 
 import functools
@@ -64,8 +65,8 @@ def draw(
 ) -> Images:
     """Draw the images of an object whose pose on the gel is known.
 
-    `resting` is the result of the first program of `sense` (`rendering.equilibrium`). The other arguments are those of
-    `sense`.
+    `sense` runs two compiled programs. The first program (`rendering.equilibrium`) computes `resting`. This function is
+    the second program. The other arguments are those of `sense`.
     """
     drawn = functools.partial(_draw, resolution=resolution, crop=crop, moving_edges=moving_edges)
     return looped(drawn)(sensor, body, resting)

@@ -32,11 +32,12 @@ from sts_jax.statespace.objective import experts, fuse, of_state
 
 
 class Calibration(NamedTuple):
-    """Numbers that correct the density of the final pose and the sharpness of samples, for each subset of the inputs.
+    """Numbers that correct the density of the final pose and set the contrast of sampled images.
 
-    Each array has one value for each subset. If `outcome`, `weight` and `variance` are 1, the density is unchanged. A
-    subset has the index `sum(2**i for i in members)`, where `members` are the positions of its inputs in
-    `Config.inputs`. For example, the subset of the first and the second input has the index 3.
+    Each array has one value for each subset of the inputs. If `outcome`, `weight` and `variance` are 1, the density is
+    unchanged. A larger `contrast` makes the outlines in sampled images sharper. A subset has the index
+    `sum(2**i for i in members)`, where `members` are the positions of its inputs in `Config.inputs`. For example, the
+    subset of the first and the second input has the index 3.
     """
 
     outcome: Float[Array, "subsets"]  # exponent of the probabilities of the outcomes, in [1/4, 4]

@@ -1,4 +1,4 @@
-"""Fit of the numbers that correct a model's predictions (`Calibration`), to trajectories outside the training set."""
+"""Fit a model's `Calibration`, the numbers that correct its predictions, to trajectories outside the training set."""
 
 import functools
 import itertools

@@ -83,7 +83,7 @@ def nearest(turn: Float[Array, "*n 9"]) -> Float[Array, "*n 3 3"]:
 
 
 def rigid(code: Float[Array, "*n 12"]) -> Float[Array, "*n 12"]:
-    """Replace the matrix in each pose code by the nearest rotation matrix."""
+    """Replace the 3x3 matrix in each pose code (a position and a matrix) by the nearest rotation matrix."""
     quat = geometry.quat_from_matrix(code[..., 3:].reshape(*code.shape[:-1], 3, 3))
     return jnp.concatenate([code[..., :3], geometry.quat_to_matrix(quat).reshape(*code.shape[:-1], 9)], axis=-1)
 
@@ -117,7 +117,7 @@ def turn_code(angle: Float[Array, "*#n 2"], code: Float[Array, "*#n 12"]) -> Flo
 
 
 def turn_code_back(angle: Float[Array, "*#n 2"], code: Float[Array, "*#n 12"]) -> Float[Array, "*#n 12"]:
-    """Rotate pose codes as `turn_code` does, but in the opposite direction. This is the inverse of `turn_code`."""
+    """Undo `turn_code`: rotate the scene about the z axis of the sensor frame by the negative angle."""
     return turn_code(angle * jnp.array([1.0, -1.0]), code)
 
 

@@ -86,7 +86,7 @@ def cell_area(gel: Gel) -> Float[Array, ""]:
 
 
 def indent(gel: Gel, heights: Float[Array, "r c"]) -> Equilibrium:
-    """Compute the pressure of an object that stays in its pose.
+    """Compute the pressure on the gel under an object that stays in its given pose.
 
     The pressure is `p = k max(0, -h)`, with the stiffness k of the gel and the heights h. Depths are clipped to the
     gel's thickness.
@@ -96,7 +96,7 @@ def indent(gel: Gel, heights: Float[Array, "r c"]) -> Equilibrium:
         heights: Heights of the object's underside above the gel's face (m), `inf` where there is no object.
 
     Returns:
-        The `Equilibrium` of an object that stays in its place. `balanced` is True, because no wrench was given.
+        The `Equilibrium`, with `sink` and `turn` equal to 0. `balanced` is True, because no wrench was given.
     """
     pressure = gel.stiffness * jnp.clip(-heights, 0, gel.thickness)
     return Equilibrium(jnp.float32(0), jnp.zeros(2), pressure, jnp.bool_(True))

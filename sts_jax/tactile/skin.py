@@ -78,7 +78,10 @@ class Leds:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Skin:
-    """Constants for the shape of the skin around an imprint, and for the shadows of the skin on itself."""
+    """Constants for the smoothing of an imprint, and for the shadows that the skin casts on itself.
+
+    The skin is the paint on the gel's outer face.
+    """
 
     # Standard deviation of the Gaussian that smooths the imprint (m). The default is 0, as in the paper.
     coupling: Scalar = dataclasses.field(default=0.0, metadata=NOT_NEGATIVE)

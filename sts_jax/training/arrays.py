@@ -17,8 +17,9 @@ class Arrays:
 
     `inputs` and `targets` are dictionaries of arrays by name, such as `visual`, `tactile` or `pose`. `present` and
     `target_present` are dictionaries of Boolean arrays. `present[name]` is True for each sample that has the input
-    `name`, and `target_present[name]` is True for each sample that has the target `name`. The first axis of all these
-    arrays and of `condition` is the sample. Images are uint8, or float32 in [0, 1].
+    `name`, and `target_present[name]` is True for each sample that has the target `name`. `condition` has the known
+    quantities of each sample, such as an acceleration of the pad, or is None. The first axis of all these arrays is the
+    sample. Images are uint8, or float32 in [0, 1].
 
     Raises:
         ValueError: The arrays whose first axis is the sample have different lengths, or the length 0.

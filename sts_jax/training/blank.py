@@ -1,4 +1,4 @@
-"""Write and read `blank.npz`, the images of the empty sensor in a model's folder."""
+"""Write and read the file `blank.npz` in a model's folder. It contains the images of the sensor without an object."""
 
 import io
 from pathlib import Path

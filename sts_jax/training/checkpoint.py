@@ -38,7 +38,7 @@ _UNDIVIDED = "state"  # the only part of checkpoints of sts_jax 0.1
 
 
 class TrainState(NamedTuple):
-    """Everything that changes during training."""
+    """The state of a training: parameters, batch statistics, optimiser state and number of gradient steps done."""
 
     params: nnx.State  # parameters
     stats: nnx.State  # running batch statistics
@@ -47,7 +47,7 @@ class TrainState(NamedTuple):
 
 
 class Weights(NamedTuple):
-    """The part of a `TrainState` that a prediction needs."""
+    """The parameters, the batch statistics and the step number of a `TrainState`, without the optimiser's state."""
 
     params: nnx.State  # parameters
     stats: nnx.State  # running batch statistics
@@ -224,8 +224,8 @@ def seal(folder: str | os.PathLike[str]) -> None:
     folder = Path(folder)
     if (folder / manifest.NAME).exists():
         raise ValueError(
-            f"{folder} already has a {manifest.NAME}, which verifies the files whenever the model is loaded: nothing "
-            f"has to be done. If you changed a file on purpose, delete {manifest.NAME} first."
+            f"{folder} already has a {manifest.NAME}, so the model can be loaded without this call. If you changed a "
+            f"file of the model on purpose, delete {manifest.NAME} and call seal again."
         )
     steps = _steps(folder)
     if not steps:

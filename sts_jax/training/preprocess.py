@@ -1,6 +1,7 @@
-"""Preprocessing of images, poses and conditions for the networks, and a test for a contact in tactile images.
+"""Preprocessing of images, poses and scenario conditions for the networks, and a contact test for tactile images.
 
-The `config.json` of a trained model contains the values of the fields of its `Preprocessing`.
+A scenario condition consists of the known quantities of a trajectory, such as the acceleration of the pad. The
+`config.json` of a trained model contains the values of the fields of its `Preprocessing`.
 """
 
 import dataclasses
@@ -134,8 +135,8 @@ class Preprocessing:
             code: Output of the network (logits for images).
 
         Returns:
-            The result of `decode_pose` for the modality `pose`, the numbers of a further modality (SI units), or images
-            in [0, 1].
+            Poses from `decode_pose` for the modality `pose`, numbers in SI units for a measurement
+            (`dataset.Measurement`) that is a vector, and images in [0, 1] for all other modalities.
         """
         if name == "pose":
             return self.decode_pose(code)

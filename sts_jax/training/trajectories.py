@@ -39,7 +39,7 @@ def frame_arrays(
 
     Returns:
         The arrays, and the preprocessing with new values of `absent` and `scales`. `absent` lists the modalities that
-        no sample has as an input, and `arrays.inputs` omits them. It contains `tactile` if no first frame shows a
+        no sample has as an input, and `arrays.inputs` omits them. `absent` contains `tactile` if no first frame shows a
         contact, and each further modality that was not measured in any first frame. `scales` contains the scale of each
         further modality that is a vector.
 
@@ -49,8 +49,8 @@ def frame_arrays(
     lacking = [own.name for own in measurements if own.name not in pairs.measurements]
     if lacking:
         raise ValueError(
-            f"pairs.measurements lacks {', '.join(lacking)}: pass the argument measurements of this function also to "
-            "Dataset.pairs"
+            f"pairs.measurements lacks {', '.join(lacking)}: call Dataset.pairs with the same argument `measurements` "
+            "as this function"
         )
     scales = tuple((own.name, float(own.scale)) for own in measurements if not own.is_image)
     preprocessing = dataclasses.replace(preprocessing, scales=scales)
@@ -173,7 +173,8 @@ def state_arrays(
             `model.input_size` pixels on each side.
         model: Configuration of the model, from `state_model`.
         scenario: Scenario of the trajectories.
-        preprocessing: Preprocessing that encodes poses and conditions, and detects contacts in tactile images.
+        preprocessing: Preprocessing that encodes poses and conditions, and detects contacts in tactile images. A
+            condition consists of known quantities of the scenario, such as the acceleration of the pad.
         empty: `visual` and `tactile` image of the empty sensor, from `dataset.empty_frame`, uint8 `(size, size, 3)`.
             The size is `model.input_size`.
         views: Rendered visual images of objects in initial poses, from `dataset.Dataset.views`. The motion of these
@@ -184,7 +185,7 @@ def state_arrays(
         The arrays.
 
     Raises:
-        ValueError: A trajectory has an outcome that the scenario does not have, or the images cannot be reduced to
+        ValueError: The outcome of a trajectory is not in `scenario.outcomes`, or the images cannot be reduced to
             `model.image_size`.
     """
     ends: list[Pairs | Ends] = [pairs] if falls is None else [pairs, falls]

@@ -37,7 +37,7 @@ class Phase(enum.StrEnum):
 
 
 class Seen(NamedTuple):
-    """The state of a scene at one time: its phase, and the pose of the object."""
+    """The state of a scene at one time: its phase (empty, held, moving or still), and the pose of the object."""
 
     phase: Phase  # phase of the scene
     trajectory: int  # number of the current trajectory, from 0. In an empty scene, number of the last one, or -1
