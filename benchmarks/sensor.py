@@ -283,7 +283,10 @@ def measure(case: Case) -> Durations:
 
 
 def rates(case: Case, found: Durations) -> str:
-    """Format a row of the first table: frames per second, and embree's seconds divided by the seconds of `sense`."""
+    """Format a row of the first table: frames per second of `sense` and embree, and how much faster `sense` is.
+
+    The last values are the time of embree divided by the time of `sense`.
+    """
     row = [f"{case.name} |"]
     for mine, theirs in ((found.frame, found.embree), (found.at_once, found.embree_at_once)):
         row += [f"{1 / mine:8.1f}  {1 / theirs[0]:6.0f}", *(f"{t / mine:6.2f}" for t in theirs), "|"]

@@ -139,7 +139,7 @@ def side(visual: np.ndarray, tactile: np.ndarray, numbers: np.ndarray, described
     Args:
         visual: Initial and final visual images, shape (n, 2, height, width, 3).
         tactile: Initial and final tactile images, of the same shape.
-        numbers: Numbers of the n trajectories.
+        numbers: Trajectory number of each of the n trajectories.
         described: Description of the source of the images, such as their folder.
     """
     visual, tactile = (leaf.reshape(-1, *leaf.shape[2:]) for leaf in (visual, tactile))

@@ -65,9 +65,9 @@ def mean(values: np.ndarray, weight: np.ndarray) -> float:
 
 
 def gain(before: np.ndarray, after: np.ndarray, weight: np.ndarray) -> float:
-    """Relative decrease of the weighted mean loss, `1 - mean(after) / mean(before)`.
+    """Relative decrease of the weighted mean loss, `1 - mean(after, weight) / mean(before, weight)`.
 
-    The arrays `before` and `after` are losses, `(n,)` each.
+    The losses `before` and `after` and their weights have the shape `(n,)`.
     """
     return 1 - mean(after, weight) / mean(before, weight)
 

@@ -96,7 +96,10 @@ def render(
 
 
 def frames_per_call() -> int:
-    """Number of frames in each `render_uint8` call of the library. Calls of equal size share one compiled program."""
+    """Number of frames that the library passes to each call of `render_uint8`.
+
+    Calls with equal numbers of frames share one compiled program.
+    """
     return CPU_RENDER_BATCH if jax.default_backend() == "cpu" else RENDER_BATCH
 
 

@@ -39,7 +39,7 @@ class State(NamedTuple):
 
 
 class Record(NamedTuple):
-    """Values in one frame: the object's pose and velocity, the pad's wrench, and contact with pad and stop wall."""
+    """State of the object in one frame: pose, velocity, wrench from the pad, and contact with pad and stop wall."""
 
     pose: Float[Array | np.ndarray, "*n 7"]  # position (m), quaternion with w >= 0
     velocity: Float[Array | np.ndarray, "*n 6"]  # m/s of the mesh frame's origin and rad/s, sensor frame

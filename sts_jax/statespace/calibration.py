@@ -52,8 +52,8 @@ def of_items(config: Config, calibration: Calibration, present: dict[str, Bool[A
     Args:
         config: Configuration of the model.
         calibration: Numbers for each subset of the inputs.
-        present: Masks `(n,)` of the inputs by name. True means that the item has the input. The density of the
-            final pose is not corrected for items that have the true state code `state` as an input.
+        present: Masks `(n,)` of the inputs by name. True means that the item has the input. An item with the input
+            `state` (the true pose, shape and mass) gets the value 1 for all numbers that correct the density.
 
     Returns:
         Numbers for each item, four arrays `(n,)`.
@@ -83,8 +83,8 @@ def predict(
         empty: `visual` and `tactile` image of the empty sensor, in [0, 1].
         condition: Known quantities of the scenario such as an acceleration, `(n, c)`, from
             `training.Preprocessing.encode_condition`. None if the model has no condition.
-        calibration: Numbers that correct the density. With None, no density is corrected. The density of an item that
-            has the true state code `state` as an input is never corrected.
+        calibration: Numbers that correct the density. With None, no density is corrected. If an item has the input
+            `state`, its density is never corrected.
 
     Returns:
         The posterior in the first frame, `(n, code + look)`, and the density of the final pose. The posterior is a

@@ -64,7 +64,10 @@ def split(code: Float[Array, "n code"]) -> State:
 
 
 def join(state: State) -> Float[Array, "n code"]:
-    """Join the parts of each state code into one vector. This is the inverse of `split`."""
+    """Join the parts of n state codes, such as the pose and the mass, into n vectors.
+
+    This function is the inverse of `split`.
+    """
     return jnp.concatenate(state, axis=-1)
 
 
