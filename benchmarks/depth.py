@@ -119,7 +119,7 @@ def cases(body: objects.Body, seed: int, numbers: Sequence[int] = NUM_POSES) -> 
     Args:
         body: The object.
         seed: Seed of the random poses.
-        numbers: Three numbers of poses: touching the pad, above the pad, and partly out of view.
+        numbers: Number of poses of each kind, in this order: touching the pad, above the pad, partly out of view.
 
     Yields:
         A pose `(7,)` and its wrench `(6,)`, see `places`.
@@ -138,7 +138,8 @@ def difference(depth: np.ndarray, truth: np.ndarray) -> Difference:
         truth: Embree's depth (m), `(h, w)`, infinite where a ray misses the object.
 
     Returns:
-        Numbers of pixels with certain errors, and the largest error in the interior of the object.
+        Numbers of pixels, such as those in the interior of the object with an error above 10 um. The field `worst` is
+        the largest error in the interior (m).
     """
     seen, hit = np.isfinite(depth), np.isfinite(truth)
     inner = interior(truth)
@@ -174,12 +175,12 @@ def measure(
 ) -> dict[str, Difference]:
     """Compare the depth in rendered frames with the depth that the ray tracer embree computes.
 
-    Embree traces the object in the pose `Frame.pose`, in which the gel balances the wrench.
+    Embree traces the object in the pose `Frame.pose`, which `sense` draws after the object has sunk into the gel.
 
     Args:
         names: Names of the objects, from `PROCEDURAL`, `LOADED` and `MADE`.
         shape: Height and width of the images (pixels).
-        numbers: Three numbers of poses: touching the pad, above the pad, and partly out of view.
+        numbers: Number of poses of each kind, in this order: touching the pad, above the pad, partly out of view.
         first_seed: Offset of the seeds of the random poses.
 
     Returns:
@@ -201,7 +202,7 @@ def measure(
 
 
 def describe(d: Difference) -> str:
-    """Format a `Difference` between depth images and embree's depth images as one row of the printed table."""
+    """Format a `Difference` between rendered depth images and embree's as one row of the printed table."""
     rest = max(d.elsewhere, 1)
     return (
         f"{d.interior:9} {100 * (1 - d.interior_beyond_10um / max(d.interior, 1)):9.4f} {d.interior_beyond_100um:7} "
@@ -211,7 +212,10 @@ def describe(d: Difference) -> str:
 
 
 def main() -> None:
-    """Print the differences from embree's depth for each image size, in a row for each object and a row for all."""
+    """Print how far rendered depths differ from the depths of embree's ray tracing.
+
+    For each image size, there is one row for each object, and a last row for all objects together.
+    """
     print(f"{'':28} interior  % <10 um  >100um  worst um elsewhere  % <1 mm silhouette  differs  strays")
     for shape in SIZES:
         found = measure(PROCEDURAL + LOADED + MADE, shape)

@@ -82,7 +82,7 @@ class Measured(NamedTuple):
 
     @property
     def rate(self) -> float:
-        """Measured number of pairs per second."""
+        """Measured number of pairs per second. A pair is a visual and a tactile image."""
         return self.pairs / self.seconds
 
     @property
@@ -155,7 +155,10 @@ def measure(lag_ms: float, pairs: int, path: Path, *, twin: bool) -> Measured:
 
 
 def report(found: list[Measured]) -> str:
-    """Format the results as a table with a row for each lag of the camera."""
+    """Format the results as a table with a row for each lag of the emulated camera.
+
+    The lag is the time from the end of an exposure to the sending of the frame.
+    """
     lines = ["lag (ms)  settling off, on (ms)  frames/s  pairs  wrong or mixed  pairs/s  limit  share  discarded  lost"]
     for row in found:
         settled = f"{1000 * row.settling.visual_s:.0f}, {1000 * row.settling.tactile_s:.0f}"
@@ -172,7 +175,10 @@ def report(found: list[Measured]) -> str:
 
 
 def measure_all(args: Args) -> list[Measured]:
-    """Read an equal share of the image pairs at each lag of the camera (`--lags-ms`), and return one result per lag."""
+    """Read an equal share of the image pairs at each lag in `args.lags_ms`, and return one result per lag.
+
+    The lag is the time from the end of an exposure to the sending of the frame by the emulated camera.
+    """
     number = len(args.lags_ms)
     found = []
     with tempfile.TemporaryDirectory() as folder:

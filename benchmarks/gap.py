@@ -325,9 +325,9 @@ def table(clean: gap.Streams, resolution: tuple[int, int]) -> Iterator[str]:
 
 
 def main(args: Args) -> None:
-    """Record the sessions `device` and `clean`, then print the table of distances.
+    """Record the image folders `device` and `clean`, then print the table of distances between sets of images.
 
-    The sessions contain images of the same scenes. The images of `device` have the default imperfections of the digital
+    Both folders contain images of the same scenes. The images of `device` have the default imperfections of the digital
     twin, and the images of `clean` have almost none. The table compares the clean images with changed copies of them.
 
     Raises:

@@ -157,12 +157,12 @@ def losses(study: Study, items: list[objects.Body], starts: Starts, touch: np.nd
     Args:
         study: Settings of the scenario.
         items: The objects.
-        starts: Starts of these objects, with one row for each start.
+        starts: Initial states and outcomes of trajectories of these objects, with one row for each trajectory.
         touch: Measurement of touch, such as the logarithm of the mass, `(n, k)`, nan without contact. None: the
             classifier has vision only.
 
     Returns:
-        The loss of each start, `(n,)`, from a classifier that was fitted to other objects.
+        The loss of each trajectory, `(n,)`, from a classifier that was fitted to other objects.
     """
     label = np.searchsorted(np.sort(study.scenario.outcomes), starts.outcome)
     features = study.features(study.scenario, items, starts, touch)
@@ -177,8 +177,9 @@ def gains(study: Study, items: list[objects.Body], starts: Starts, read: np.ndar
     Args:
         study: Settings of the scenario.
         items: The objects.
-        starts: Starts of these objects, with one row for each start.
-        read: Measurement of touch that a network estimated from images, `(n, k)`. None: print no lines for the network.
+        starts: Initial states and outcomes of these objects' trajectories, with one row for each trajectory.
+        read: Estimates of `study.touch(starts)` by a network that saw the tactile images, `(n, k)`. None: print no
+            lines for the network.
     """
     exact = study.touch(starts)
     rough = exact + study.noise * np.random.default_rng(0).normal(size=exact.shape)
@@ -223,7 +224,7 @@ def pictures(study: Study, learned: Lesson, starts: Starts, steps: int) -> np.nd
     Args:
         study: Settings of the scenario.
         learned: Training data of the network, and the images under study.
-        starts: The starts that the images under study show.
+        starts: Initial states of trajectories, in the order of the images under study.
         steps: Training steps of the network.
 
     Returns:
@@ -266,9 +267,9 @@ def detect(name: str, images: np.ndarray, starts: Starts, new: np.ndarray, held_
     Args:
         name: Name of the images, for the printed line.
         images: Training images, uint8 `(n, h, w, 3)`.
-        starts: Starts that the training images show.
+        starts: Initial states that the training images show, with the fill of each object.
         new: Images of held-out objects, uint8 `(m, h, w, 3)`.
-        held_out: Starts that the held-out images show.
+        held_out: Initial states that the held-out images show, with the fill of each object.
         steps: Training steps of the network.
     """
     read = cnn.fit(jax.random.key(1), images, starts.fill[:, None] > 0.5, steps=steps)
@@ -287,7 +288,7 @@ def fill(learned: Lesson, items: list[objects.Body], starts: Starts, num: int, s
     Args:
         learned: Training data, and the tactile images under study.
         items: The objects under study.
-        starts: Their starts.
+        starts: Initial states of the objects' trajectories, in the order of the tactile images under study.
         num: Number of falls of each object under study.
         steps: Training steps of the networks.
     """

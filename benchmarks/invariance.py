@@ -86,7 +86,7 @@ class MirroredPerturbed(physics.Perturbed):
 
 
 def mirror(start: Start) -> Start:
-    """Mirror a start, so that y becomes -y in its pose and in its condition (such as an acceleration of the pad)."""
+    """Mirror the start of a trajectory: y becomes -y in its pose and its condition (such as the pad's acceleration)."""
     return start._replace(pose=turn(start.pose, 4), condition=turn_condition(start.condition, 4))
 
 
@@ -288,11 +288,13 @@ def named(case: Case, first: Array | np.ndarray, last: Array | np.ndarray) -> np
 
 
 def difference(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
-    """95 % interval of the difference of two shares, for paired runs.
+    """95 % interval of the difference between the shares of a label in two sets of runs.
+
+    A label names the state at the end of a run. Run i of the first set is paired with run i of the second set.
 
     Args:
-        a: True for the runs that have a label on one side, `(n,)`.
-        b: True for the runs that have the same label on the other side, `(n,)`.
+        a: True for the runs of the first set that have the label, `(n,)`.
+        b: True for the runs of the second set that have the label, `(n,)`.
 
     Returns:
         Middle and half width of the interval of `mean(b) - mean(a)`.
@@ -303,7 +305,7 @@ def difference(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
 
 
 def sides(case: Case, num: int) -> dict[str, np.ndarray]:
-    """Compute a case in all ways, such as with MJX and with C MuJoCo, and label the runs by their results.
+    """Simulate a case in several ways, such as with MJX and with C MuJoCo, and label each run by its final state.
 
     These ways are called sides. The docstring of the module describes them.
 
@@ -370,9 +372,10 @@ def compare(found: dict[str, np.ndarray], labels: Sequence[str], margin: float =
 
 
 def main(args: Args) -> None:
-    """Simulate each case on all sides (see the docstring of the module), and print the comparison of the sides.
+    """Simulate each case on all sides, and print the comparison of the sides.
 
-    With `--only`, a single case is simulated.
+    A side is one way to simulate a case, such as with half the time step or with C MuJoCo (see the docstring of the
+    module). With `--only`, a single case is simulated.
     """
     within = [compare(sides(case, args.num), case.labels) for case in cases() if args.only in (None, case.name)]
     print(f"every interval within {100 * MARGIN:.0f} points: {'yes' if all(within) else 'NO'}")

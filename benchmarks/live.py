@@ -107,7 +107,10 @@ def skill(found: np.ndarray, truth: np.ndarray) -> float:
 
 
 def main(args: Args) -> None:
-    """Record the trajectories, and print a table with the skill of every model.
+    """Record trajectories of the digital twin, and print a table with the skill of every model.
+
+    The skill is a score of the predicted images. Perfect images have the skill 1. The mean of the images at rest of the
+    other trajectories has the skill 0.
 
     In the rows with `kept`, the images contain the background of the twin, such as its vignetting. In the rows with
     `divided out`, this background is replaced by the background of the model's training images (`hardware.relit`).

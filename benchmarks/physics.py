@@ -95,7 +95,7 @@ class Args:
 
 
 class Speeds(NamedTuple):
-    """Steps per second of three ways to simulate a given number of worlds."""
+    """Steps per second for a number of worlds: MJX in one call, MJX in chunks of worlds, and C MuJoCo."""
 
     worlds: int  # trajectories that are simulated together
     at_once: float  # MJX, one call for all worlds
@@ -207,10 +207,11 @@ def grouped(models: list, states: np.ndarray) -> list[tuple[list, np.ndarray]]:
 
 
 def worlds(count: int, frames: int) -> tuple[Worlds, mjx.Model, mjx.Data]:
-    """Make the arguments that `simulate` passes to MJX for drops of the rod from a height of 2 mm.
+    """Make the arguments that `simulate` passes to MJX, for a rod (`rod`) that drops from a height of 2 mm.
 
     Args:
-        count: Number of worlds. The first 256 worlds have different starts. Further worlds repeat these starts.
+        count: Number of worlds, which are trajectories that MJX simulates in parallel. The first 256 worlds have
+            different starts. Further worlds repeat these starts.
         frames: Frames of each trajectory.
 
     Returns:

@@ -67,7 +67,7 @@ class Presses:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Pixels:
-    """Pixels of several images of the pressed ball, in one list."""
+    """Pixels of several images of a ball that is pressed into the sensor, in one list."""
 
     normals: Float[Array, "p 3"]  # unit normals of the skin, towards the camera
     points: Float[Array, "p 3"]  # points of the skin (m), with the origin in the middle of the image
@@ -130,13 +130,13 @@ def skin_under_ball(
 
 
 def pixels(presses: Presses, which: np.ndarray, *, every: int = 1, within: float = TRUSTED) -> Pixels:
-    """Collect pixels within the contacts of several presses.
+    """Collect pixels of the contact circles in several images of a ball that is pressed into the sensor.
 
     Args:
-        presses: The images and contacts.
-        which: Indices of the presses.
+        presses: The images, and the contact circle in each.
+        which: Indices of the images.
         every: Step from one used row to the next, and from one used column to the next.
-        within: Share of the contact's radius within which pixels are used.
+        within: Share of the circle's radius within which pixels are used.
     """
     shape, found = presses.background.shape[:2], []
     rows, columns = np.meshgrid(np.arange(0, shape[0], every), np.arange(0, shape[1], every), indexing="ij")
@@ -205,7 +205,11 @@ def changes(constants: tactile.Phong, lights: tactile.Lights | tactile.Leds, giv
 
 @jax.jit
 def draw(constants: tactile.Phong, lights: tactile.Lights | tactile.Leds, given: Pixels) -> Float[Array, "p 3"]:
-    """Render the image of the pressed skin, `background (1 + phong(pressed) - phong(flat))`."""
+    """Render colours of the pressed skin, `background (1 + phong(pressed) - phong(flat))`.
+
+    `background` is the image without contact. `phong` is the image of the pressed or the flat skin in Phong's
+    reflectance model with the given constants and lights.
+    """
     return given.background * (1 + changes(constants, lights, given).T @ lights.colors)
 
 
@@ -220,7 +224,7 @@ def _inverse(value: float | np.ndarray) -> Array:
 
 
 def start(given: Pixels, *, near: bool) -> dict[str, Array]:
-    """Initial values of the unknowns of `shader`.
+    """Return the initial lights and reflectance of the optimisation, as the argument `unknowns` of `shader`.
 
     Non-negative least squares selects the lights from candidates in rings around the image. The fall-off, the specular
     reflectance and the shininess start from constants.
@@ -259,7 +263,16 @@ def refine(unknowns: dict[str, Array], given: Pixels, *, near: bool, steps: int)
 
 
 def fit(given: Pixels, *, near: bool, steps: int = STEPS) -> tuple[tactile.Phong, tactile.Lights | tactile.Leds]:
-    """Fit the constants of the reflectance and the lights to pixels."""
+    """Fit the constants of the reflectance and the lights to the colours of pixels in real tactile images.
+
+    Args:
+        given: The pixels.
+        near: True fits near lights (LEDs), and False fits far lights.
+        steps: Number of steps of Adam.
+
+    Returns:
+        The constants of the reflectance, and the lights.
+    """
     return shader(refine(start(given, near=near), given, near=near, steps=steps), near=near)
 
 

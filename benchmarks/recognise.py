@@ -37,7 +37,7 @@ class Args:
 
 
 def main(args: Args) -> str:
-    """Draw predicted and true images in one picture, and return the correct matches as text.
+    """Draw predicted images (A to J) and true images (1 to 10) in one picture, and return the correct pairs as text.
 
     Raises:
         ValueError: `first` is negative, or fewer than ten held-out trajectories have an index of at least `first`.

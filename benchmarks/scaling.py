@@ -95,7 +95,13 @@ def train(
 
 
 def best_possible(workdir: Path) -> float | None:
-    """Read the visual skill of the best possible prediction from `metrics.json`. None: the file or value is missing."""
+    """Read the skill of the best possible prediction of visual images from `metrics.json` in a work directory.
+
+    The skill is a score of predicted images (see `evaluation.metrics.skill`).
+
+    Returns:
+        The skill, or None if the file or the value is missing.
+    """
     path = workdir / "metrics.json"
     if not path.exists():
         return None

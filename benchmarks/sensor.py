@@ -224,7 +224,7 @@ def frames(
 
 
 def speed() -> None:
-    """Print frames per second of `sense` and embree, with a row for each object and image size.
+    """Print frames per second of `sense` and of the ray tracer Embree, with a row for each object and image size.
 
     A second table has the share of the time that each stage of `sense` takes.
     """
@@ -283,9 +283,10 @@ def measure(case: Case) -> Durations:
 
 
 def rates(case: Case, found: Durations) -> str:
-    """Format a row of the first table: frames per second of `sense` and embree, and how much faster `sense` is.
+    """Format a table row: frames per second of `sense` and of embree, and the ratios of their times.
 
-    The last values are the time of embree divided by the time of `sense`.
+    The row has these values first for one frame at a time, and then for several frames at once. A ratio is the time of
+    embree divided by the time of `sense`. There is one ratio for each of the three ways to call embree, see `embree`.
     """
     row = [f"{case.name} |"]
     for mine, theirs in ((found.frame, found.embree), (found.at_once, found.embree_at_once)):
@@ -294,7 +295,7 @@ def rates(case: Case, found: Durations) -> str:
 
 
 def shares(case: Case, found: Durations) -> str:
-    """Format a row of the second table: the time of `sense` per frame (ms), and each stage's share of this time (%).
+    """Format one case as a table row: the time of `sense` per frame (ms), and each stage's share of this time (%).
 
     The stages are the balance of the gel, the depth, the visual image and the tactile image. For images of 640x480
     pixels, the row also has the speed of `sense` relative to the paper's code.
@@ -323,13 +324,22 @@ def ball(shape: tuple[int, int], pitch: float, *, radius: float = 4e-3, depth: f
 
 
 def waves(shape: tuple[int, int], pitch: float, *, depth: float = 1e-3) -> np.ndarray:
-    """Imprint of waves over a whole image. The arguments and the result are those of `ball`, without `radius`."""
+    """Imprint of waves over a whole image.
+
+    Args:
+        shape: Height and width of the image (pixels).
+        pitch: Width of a pixel (m).
+        depth: Largest depth of the imprint (m).
+
+    Returns:
+        Depth of the imprint (m), `shape`.
+    """
     y, x = ((np.arange(n) - (n - 1) / 2) * pitch for n in shape)
     return (depth * (0.6 + 0.2 * np.sin(2e3 * x)[None, :] + 0.2 * np.sin(1.4e3 * y)[:, None])).astype(np.float32)
 
 
 def compare_taxim(shape: tuple[int, int] = (480, 640), pitch: float = 0.0295e-3) -> None:
-    """Print the time of `touch` and of taxim for the tactile image of an imprint.
+    """Print the time that `sts_jax.touch` and the simulator Taxim need for a tactile image of an imprint.
 
     Args:
         shape: Height and width of the image (pixels).

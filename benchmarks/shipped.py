@@ -86,7 +86,7 @@ def collection(args: Args) -> dataset.Collection:
 def if_calibrated(confidence: np.ndarray, *, draws: int = DRAWS, seed: int = 0) -> float:
     """Compute the mean calibration error that chance alone causes if the predicted probabilities are correct.
 
-    In each draw, the likeliest outcome of each trajectory is the true one with its predicted probability.
+    In each draw, the likeliest outcome of trajectory i is the true one with the probability `confidence[i]`.
 
     Args:
         confidence: Probability of the likeliest outcome of each trajectory, `(n,)`.

@@ -101,8 +101,9 @@ def block(name: str, index: int, size: int) -> dict[str, np.ndarray]:
     Returns:
         Arrays by name, with a row for each trajectory. `wrench_error` is the length of (force of the pad at rest +
         weight vector), divided by the weight. It is nan for trajectories whose object does not rest on the pad or
-        touches the wall. `excess` is the largest `excess_energy` in frames without contact. It is -inf for trajectories
-        whose object fell off or had contact in every frame. It is nan for scenarios in which gravity changes.
+        touches the wall. `excess` is the largest gain of energy since the first frame, over the frames without contact
+        (see `excess_energy`). It is -inf for trajectories whose object fell off or had contact in every frame. It is
+        nan for scenarios in which gravity changes.
     """
     scenario = SCENARIOS[name]
     first = index * size // NUM
@@ -138,7 +139,7 @@ def block(name: str, index: int, size: int) -> dict[str, np.ndarray]:
 
 
 def claim(folder: Path, name: str, size: int) -> None:
-    """Write the settings with which the trajectories of a scenario are simulated to a JSON file in a folder.
+    """Write a JSON file with the simulation settings of a scenario, such as the number of trajectories per object.
 
     Raises:
         ValueError: The folder already has such a file with other settings. The message names all settings that differ.
@@ -182,7 +183,7 @@ def report(name: str, found: dict[str, np.ndarray]) -> str:
 
     Args:
         name: Name of the scenario.
-        found: Arrays that `block` returns, concatenated over all blocks.
+        found: Arrays by name, with a row for each trajectory of the scenario. `block` describes them.
     """
     outcome = found["outcome"]
     shares = {o.name.lower(): np.mean(outcome == o) for o in SCENARIOS[name].outcomes}

@@ -59,7 +59,7 @@ class Config:
 
     @property
     def board(self) -> hardware.Board:
-        """Calibration board with the sizes of its print: the nominal sizes times `ruler` / 100.
+        """Calibration board with the sizes that it has on the printed page: the nominal sizes times `ruler` / 100.
 
         `ruler` is the measured length of the ruler on the printed page (mm). It is 100 if the printer does not scale.
         """
@@ -227,7 +227,9 @@ def live(config: Config, sensor: hardware.STS, pinhole: hardware.Pinhole) -> har
     """Take the missing pictures of the board, and calibrate the lens from all pictures in OUT/board.
 
     Raises:
-        CalibrationError: As in `fit`. The message explains how to replace or add pictures.
+        CalibrationError: The pictures do not determine the lens or do not cover the view of the sensor, or the raw
+            image does not contain the whole view. The view is the part of the gel's outer face that rectified images
+            show. The message explains how to replace or add pictures.
         ValueError: A picture of an earlier run has another size or cannot be read, or `every` is None and there is no
             keyboard on which to press Enter.
     """
@@ -265,7 +267,7 @@ def check_folder(config: Config, camera: hardware.Camera, leds: hardware.Leds) -
 
 
 def claim_pictures(config: Config, camera: hardware.Camera) -> None:
-    """Reserve the folder of live pictures for one camera, one image size and one printed board.
+    """Reserve the folder OUT/board for pictures from one camera, of one size and of one printed calibration board.
 
     Raises:
         ValueError: The folder has pictures from another camera, of another size, or of another print of the board (the

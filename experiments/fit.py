@@ -66,7 +66,8 @@ class Slope(NamedTuple):
     """The loss of an image, with the gradient and the Gauss-Newton matrix with respect to (x, y, yaw).
 
     r is the vector of the n pixel values of the blurred difference between the image and the target, and J is its
-    Jacobian `dr / d(x, y, yaw)`, of shape (n, 3). The fields are computed from r and J.
+    Jacobian `dr / d(x, y, yaw)`, of shape (n, 3). The field `loss` is `r^T r / n`. The fields `gradient`, which is
+    `J^T r / n`, and `curvature`, which is `J^T J / n`, are the gradient and the Gauss-Newton matrix of `loss / 2`.
     """
 
     image: jax.Array  # tactile image, shape (h, w, 3)
@@ -100,7 +101,9 @@ def moved(pose: jax.Array, at: jax.Array) -> jax.Array:
 
 
 def carried(wrench: jax.Array, pose: jax.Array, at: jax.Array) -> jax.Array:
-    """Compute the wrench of the pad on the object after a move, for a vertical force that moves with the object.
+    """Compute the wrench that the pad exerts on the object after a move of the object.
+
+    The force is vertical, and moves with the object.
 
     Args:
         wrench: Force (N) and moment about the sensor's origin (N m) that the pad exerts on the object before the move,
@@ -132,9 +135,9 @@ def slope(
 ) -> Slope:
     """Compute the loss of the moved object's image, and the derivatives of the loss with respect to the move.
 
-    The image and the target are blurred before they are compared. For each value of `at`, the depth and the tilt of the
-    object are computed from the balance of forces in the gel. The pad has the same properties at every position, so the
-    depth and the tilt do not depend on the move. The derivatives therefore treat the depth and the tilt as constant.
+    The loss is the mean of the squared values of the blurred difference between the image and the target. The depth and
+    the tilt of the moved object are computed from the balance of forces in the gel. The derivatives treat the depth and
+    the tilt as constant, because the pad has the same properties at every position.
 
     Args:
         sensor: Constants of the sensor.
@@ -143,7 +146,7 @@ def slope(
         wrench: Force (N) and moment about the sensor's origin (N m) that the pad exerts on the object before the move,
             shape (6,).
         at: Shift in x and y (m) and turn (rad), shape (3,).
-        target: Image to which the pose is fitted, shape (height, width, 3).
+        target: Tactile image to which the pose is fitted, shape (height, width, 3).
         blur: Standard deviation of the Gaussian blur (m).
         resolution: (height, width) of the image (pixels).
     """
@@ -196,7 +199,11 @@ def errors(at: np.ndarray) -> tuple[float, float]:
 
 
 def draw(config: Config, target: np.ndarray, paths: list[list[tuple[np.ndarray, Slope]]]) -> None:
-    """Draw the first fit (target, start, end, start minus target, end minus target) and the paths of all fits."""
+    """Draw five images of the first fit, and the paths of the pose in all fits.
+
+    The images are the target, the rendered images of the poses at the start and at the end of the fit, and the
+    differences of these two images from the target.
+    """
     (_, first), (_, last) = paths[0][0], paths[0][-1]
     flat = np.median(target, axis=(0, 1))
     touched = np.abs(np.stack([target, first.image]) - flat).max(axis=(0, -1)) > SEEN
@@ -230,7 +237,7 @@ def draw(config: Config, target: np.ndarray, paths: list[list[tuple[np.ndarray, 
 
 
 def main(config: Config) -> None:
-    """Place the object on the pad, render the target, fit the pose from every start, and draw the result.
+    """Render a tactile image of the object on the pad, fit the pose to this image several times, and draw the result.
 
     Raises:
         ValueError: An option is out of range, or the object leaves no imprint.

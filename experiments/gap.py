@@ -183,7 +183,9 @@ def load(config: Config) -> tuple[Side, Side]:
             "rectified: leave out --simulated-sensor"
         )
     if config.resolution is not None and min(config.resolution) < gap.LEAST_SIDE:
-        raise ValueError(f"--resolution must be at least {gap.LEAST_SIDE} x {gap.LEAST_SIDE}, got {config.resolution}")
+        raise ValueError(
+            f"--resolution must be at least {gap.LEAST_SIDE} x {gap.LEAST_SIDE} pixels, got {config.resolution}"
+        )
     if is_dataset:
         simulated = simulated_dataset(config.simulated, config.resolution)
     else:
@@ -248,7 +250,7 @@ def written(estimate: gap.Estimate, digits: int) -> str:
 
 
 def draw(config: Config, real: Side, simulated: Side, *, matched: bool) -> None:
-    """Draw the initial and the final images of the first trajectories into `gap.png`."""
+    """Draw the real and the simulated images of the first `config.rows` trajectories into `gap.png`."""
     rows = config.rows
     numbers = np.unique(real.images.group)[:rows]
     others = numbers if matched else np.unique(simulated.images.group)[:rows]

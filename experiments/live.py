@@ -187,7 +187,7 @@ def views(config: Config, source: Source, first: hardware.Shot) -> Views:
 
 
 def images(config: Config, source: Source) -> Iterator[hardware.Shot]:
-    """Read the images of both streams from the connected source, until it ends."""
+    """Read the images of the visual and the tactile stream from the connected source, until the source ends."""
     if isinstance(source.sensor, hardware.Replay):
         return source.sensor.stream()
     return source.sensor.stream(0.5, dwell=config.dwell)
@@ -245,7 +245,7 @@ class Screen:
         """Return the newest images and the newest prediction.
 
         Returns:
-            The images and the prediction. While a stream has no image yet, None.
+            The images and the prediction, or None until both a visual and a tactile image have been added.
         """
         shown, live, arrived_s = self._shown, self.live, list(self._arrived_s)
         if len(shown) < 2 or live is None:
@@ -265,7 +265,7 @@ class Screen:
         )
 
     def close(self) -> None:
-        """Complete the file of `--save`, and print its path."""
+        """Complete the picture or video that the option `--save` names, and print its path."""
         if self._file is not None and self._file.close():
             print(self._path)
 

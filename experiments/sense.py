@@ -189,7 +189,8 @@ def look(config: Config, sensor: sts.Sensor, body: sts.objects.Body) -> tuple[st
     """Place and render the object.
 
     Returns:
-        The frame, an image with the LEDs at `config.light` times full power, and a description that has three lines.
+        A tuple `(frame, between, text)`. `frame` has all outputs of the sensor. `between` is a further image, with the
+        LEDs at `config.light` times full power. `text` is a description of three lines.
     """
     pose, wrench, words = lay(config, sensor, body)
     given = sensor, body, jnp.asarray(pose, jnp.float32), jnp.asarray(wrench, jnp.float32)

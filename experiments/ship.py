@@ -72,7 +72,7 @@ def ship(workdir: Path, name: str) -> str:
 
 
 def compare(original: sts.Predictor, rounded: sts.Predictor) -> str:
-    """Return a line with the differences between the predictions of two models.
+    """Return a line of text with the differences between the predictions of two models.
 
     Both models predict from the same visual images, which `bottles` renders.
     """

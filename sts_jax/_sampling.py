@@ -74,8 +74,9 @@ def shifted(
     """Shift an image by an offset, with interpolation between its pixels.
 
     Args:
-        around: The image (h, w) inside a border of h + 1 rows above and below it, and w + 1 columns left and right of
-            it. The border has the values that the shift moves into the image.
+        around: Array of the shape (3 h + 2, 3 w + 2). It contains the image (h, w) and a border around the image, which
+            has h + 1 rows above and below, and w + 1 columns on the left and on the right. The border has the values
+            that the shift moves into the image.
         columns: Horizontal part of the offset (pixels). It is clipped to [-w, w].
         rows: Vertical part of the offset (pixels). It is clipped to [-h, h].
         shape: Height h and width w of the image without the border (pixels).

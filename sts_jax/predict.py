@@ -108,7 +108,7 @@ class Predictor:
             there = getattr(preprocessing, field)
             if asked is not None and asked != there:
                 raise ValueError(
-                    f"{folder} was trained with {field}={there}, but {field}={asked} was requested: "
+                    f"the model {folder} was trained with {field}={there}, but {field}={asked} was requested: "
                     f"render images with {field}={there}, or train a model with {field}={asked}."
                 )
         if isinstance(model.config, statespace.Config):

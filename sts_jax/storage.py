@@ -116,10 +116,10 @@ def read_json(path: Path, remedy: str) -> Any:
 
 
 def decode(kind: type[Fields], values: Any, name: str) -> Fields:
-    """Make a dataclass from JSON values, and check the types of the values.
+    """Make an instance of a dataclass from JSON values, and check the types of the values.
 
-    A list becomes a tuple. A whole number becomes a float if the type of its field is float. A JSON object becomes a
-    nested dataclass.
+    A list becomes a tuple. A whole number becomes a float if the type of its field is float. A JSON object becomes an
+    instance of a nested dataclass.
 
     Args:
         kind: The dataclass. The types of its fields are numbers, strings, tuples, dataclasses, and unions of these.
@@ -127,7 +127,7 @@ def decode(kind: type[Fields], values: Any, name: str) -> Fields:
         name: Name of the values in error messages, such as "device".
 
     Returns:
-        The dataclass.
+        The instance.
 
     Raises:
         ValueError: A field is missing, unknown or of a wrong type, or the dataclass refuses a value. The message names
@@ -156,7 +156,11 @@ def _first_fault(fault: ErrorDetails, name: str) -> str:
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write named arrays to an `.npz` file atomically. Errors are those of `write_whole`."""
+    """Write named arrays to an `.npz` file atomically.
+
+    Raises:
+        OSError: The file cannot be written. The message names the file and the remedy.
+    """
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **arrays)
     write_bytes(path, buffer.getvalue())

@@ -33,7 +33,7 @@ def draw(number: int, size: tuple[int, int] = SIZE) -> Image:
 
 
 def number_of(image: Image) -> int:
-    """Read the number that an image of `draw` shows."""
+    """Read the number that an image from `draw` shows as dark and light blocks."""
     height, width = image.shape[0] // 4, image.shape[1] // 4
     centres = image[height // 2 :: height, width // 2 :: width].mean(-1)[:4, :4].ravel()
     return sum(1 << bit for bit, value in enumerate(centres) if value > 157)
@@ -113,7 +113,11 @@ class MotionJpeg:
         self.thread.join()
 
     def answer(self, request: http.server.BaseHTTPRequestHandler) -> None:
-        """Answer a request for the stream, and send frames until the server stops or the mode ends the stream."""
+        """Answer a request for the stream in the way that the attribute `mode` selects.
+
+        Frames are sent until the server stops or `mode` is set to `close`. In the modes `hang`, `missing` and `text`,
+        no frames are sent.
+        """
         if self.mode == "hang":
             self._pause("hang")
             return

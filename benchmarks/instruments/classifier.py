@@ -60,7 +60,7 @@ def probabilities(x: np.ndarray, y: np.ndarray, groups: np.ndarray) -> np.ndarra
 
 
 def mean(values: np.ndarray, weight: np.ndarray) -> float:
-    """The weighted mean."""
+    """Return the weighted mean, `sum(weight * values) / sum(weight)`."""
     return float(np.average(values, weights=weight))
 
 
@@ -73,9 +73,10 @@ def gain(before: np.ndarray, after: np.ndarray, weight: np.ndarray) -> float:
 
 
 def kept(before: np.ndarray, after: np.ndarray, other: np.ndarray, weight: np.ndarray) -> float:
-    """The `gain` from `before` to `other`, divided by the `gain` from `before` to `after`.
+    """Ratio of two gains, `gain(before, other, weight) / gain(before, after, weight)`.
 
-    The arrays `before`, `after` and `other` are losses, `(n,)` each.
+    A gain is the relative decrease of the weighted mean loss. The losses `before`, `after` and `other` and their
+    weights have the shape `(n,)`.
     """
     return gain(before, other, weight) / gain(before, after, weight)
 

@@ -28,7 +28,7 @@ class Sight(NamedTuple):
 
 
 def look(body: objects.Body) -> tuple[np.ndarray, float, np.ndarray]:
-    """Compute the row of one object in each field of `Sight`.
+    """Compute properties of one object's visible shape: its row in each field of `Sight`.
 
     Returns:
         Profile (radii and height), height of the lowest point in the mesh frame, and mass properties at each fill
@@ -115,7 +115,7 @@ def shaken(
     Args:
         scenario: The scenario.
         items: The objects.
-        starts: Starts of these objects, with one row for each start.
+        starts: Initial states of trajectories of these objects, with one row for each trajectory.
         touch: Measured logarithm of the mass in kg, `(n, 1)`. None: return features from vision alone.
 
     Returns:

@@ -14,5 +14,7 @@ def public_meshes() -> Path:
     """
     found = importlib.util.find_spec("miniworld")
     if found is None or found.origin is None:
-        raise ModuleNotFoundError("the meshes need the package miniworld, which is missing: pip install -e '.[test]'")
+        raise ModuleNotFoundError(
+            "the test meshes are in the package miniworld, which is missing: pip install -e '.[test]'"
+        )
     return Path(found.origin).parent / "meshes"

@@ -203,12 +203,15 @@ class SensorPeer:
         return found is not None and found.shares == [1.0 if lit else 0.0]
 
     def stop(self) -> None:
-        """Unplug the camera and the controller."""
+        """Unplug the emulated camera and the emulated LED controller."""
         self.camera.stop()
         self.leds.vanish()
 
     def shown(self) -> dict[int, Shown]:
-        """Return the light of each frame from the log: a dictionary from the frame's number (`key`) to its `Shown`."""
+        """Return the mean light during the exposure of each frame that the emulated camera has logged.
+
+        The result is a dictionary from the number of a frame to its `Shown`. `key` reads this number from an image.
+        """
         return {number: Shown(number, exposure.mean) for number, exposure in self.camera.log.items()}
 
 

@@ -14,5 +14,5 @@ class Shown(NamedTuple):
     light: float  # mean light during the exposure, as a share of the full power
 
     def is_of(self, share: float) -> bool:
-        """Return True if the mean light differs from `share` (of the lights' full power) by at most 0.001."""
+        """Return True if the mean light during the exposure differs from `share` by at most 0.001 of the full power."""
         return abs(self.light - share) <= _TOLERANCE

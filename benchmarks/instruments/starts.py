@@ -92,14 +92,14 @@ def roll(
     again: int = 0,
     reroll: tuple[str, ...] = (),
 ) -> Starts:
-    """Simulate trajectories of each object, and repeat some of them with other hidden properties.
+    """Simulate trajectories of each object, and repeat some of them with other hidden properties (such as friction).
 
     Args:
         key: Random key.
         items: The objects.
         scenario: The scenario.
         num: Number of trajectories of each object.
-        again: Number of trajectories of each object that are repeated from the same start.
+        again: Number of trajectories of each object that are repeated from the same initial state.
         reroll: Fields of `physics.Hidden` that are drawn again for the repetitions.
     """
     key, fresh = jax.random.split(key)
@@ -157,7 +157,7 @@ def draw(items: list[objects.Body], starts: Starts) -> tuple[np.ndarray, np.ndar
 def kept(folder: Path | None, name: str, make: Callable[[], Starts]) -> Starts:
     """Load starts from a file. If the file does not exist, make the starts and write the file.
 
-    Starts are the initial states of trajectories, which are stored together with the outcomes.
+    A start is the initial state of a trajectory. It is stored together with the outcome of this trajectory.
 
     Args:
         folder: Folder of the file. None: make the starts and write nothing.

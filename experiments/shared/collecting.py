@@ -164,14 +164,15 @@ def of_twin(config: Collect) -> simulated.Simulated:
 def keep(file: Path, workdir: Path) -> None:
     """Copy a sensor file and its backgrounds into a work directory.
 
-    If the work directory already contains a sensor file, only check that both files describe the same device.
+    If the work directory already contains a sensor file, nothing is copied, and both sensor files must have the same
+    content.
 
     Args:
         file: Path of the sensor file or of its folder.
         workdir: Work directory.
 
     Raises:
-        ValueError: The sensor file in the work directory differs.
+        ValueError: The work directory already contains a sensor file with another content.
         SensorFileError: A sensor file is damaged.
         OSError: A file cannot be read or written.
     """
@@ -247,6 +248,7 @@ class AutomaticPage(AutomaticPerson):
     def action(self) -> hardware.Action | None:
         """Return the action of the button that was pressed last, or the automatic action if no button was pressed.
 
-        The automatic action is `Action.CONFIRM` in the stage `REVIEW`, and otherwise None.
+        The automatic action is `Action.CONFIRM` in the stage `REVIEW`, in which a recorded trajectory is confirmed or
+        discarded. In all other stages, it is None.
         """
         return self._page.action() or super().action()

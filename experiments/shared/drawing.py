@@ -25,8 +25,9 @@ def draw(
 ) -> list[Path]:
     """Draw the main model's predictions from vision and from all inputs, and the calibration of outcome probabilities.
 
-    If the model predicts samples of the pose, further figures show the predicted and the re-rolled positions at rest.
-    A re-roll is another simulation from the same initial state, with new random hidden properties such as friction.
+    The main model is the model that the main table of results shows. If it predicts samples of the pose, further
+    figures show the predicted and the re-rolled positions at rest. A re-roll is another simulation from the same
+    initial state, with new random hidden properties such as friction.
 
     Args:
         config: Configuration of the experiment.

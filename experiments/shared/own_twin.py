@@ -59,7 +59,11 @@ class OwnTwin:
                     return
 
     def phase(self, command: str) -> dict[str, object]:
-        """Send a command (`hold`, `release` or `clear`) to the twin, and return the twin's state after the command."""
+        """Send a command to the digital twin of the sensor, and return the state of the twin after the command.
+
+        Args:
+            command: `hold` holds an object on the pad, `release` lets it go, and `clear` takes it away.
+        """
         request = urllib.request.Request(f"{self._url}/{command}", method="POST")
         with urllib.request.urlopen(request, timeout=_ANSWER_S) as answer:
             return json.load(answer)

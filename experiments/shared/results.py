@@ -21,7 +21,7 @@ def write(path: Path, content: Mapping[str, Any], inputs: Mapping[str, str], out
     Args:
         path: Path of the JSON file.
         content: Results.
-        inputs: Checksum of each input, by name. `stale` returns a text with the name of a changed input.
+        inputs: Checksum of each input, by name. `stale` compares these checksums with those of the current inputs.
         outputs: Further output files, in the folder of `path` or below it.
     """
     record = {

@@ -115,7 +115,7 @@ def collect(config: Simulated) -> None:
 
 
 def lens(config: Simulated, sensor: sts.Sensor) -> hardware.Lens:
-    """Make the lens of the twin, an equidistant lens with a field of view of 160 degrees across the diagonal."""
+    """Make the lens of the digital twin, an equidistant lens with a diagonal field of view of 160 degrees."""
     return hardware.Lens.ideal(
         *config.size, field_of_view=math.radians(FIELD_OF_VIEW), distance=float(sensor.camera.distance)
     )

@@ -80,7 +80,11 @@ class Site(abc.ABC):
         """
 
     def still(self, path: str) -> Image | None:
-        """The single image at a path such as `end/initial/visual.jpg`, or None if there is none."""
+        """The image at a URL path such as `end/initial/visual.jpg`. The result is None if the site has no such image.
+
+        Subclasses override this method if their page shows images that do not belong to a live stream. `Site` itself
+        has no such images.
+        """
         return None
 
     def pressed(self, content: Any) -> bool:

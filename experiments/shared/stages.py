@@ -141,8 +141,8 @@ def jobs(
         views: Further images of the training objects. Only the state-space model uses them.
         falls: First and last poses in trajectories of the training objects, without images. Only the state-space model
             uses these poses.
-        measurements: Further modalities of the paper's model with all modalities. `pairs.measurements` must contain
-            their values.
+        measurements: Modalities of the paper's model `mvae` in addition to `visual`, `tactile` and `pose`. The other
+            models do not use them. `pairs.measurements` must contain their values.
     """
     preprocessing, scenario = preprocessing_of(config), config.collection.scenario
     frame = dataset.empty_frame(sensor, config.collection)

@@ -16,7 +16,7 @@ PARTS = ("train", "validation", "test")  # the parts into which the objects are 
 
 @dataclasses.dataclass(frozen=True)
 class Collection:
-    """Description of a dataset: its scenario, objects, numbers of trajectories, images, split and seed.
+    """Description of a dataset: its scenario, objects, trajectories, images, split and seed.
 
     A collection and a `Sensor` determine every byte of the dataset, as long as the code of the scenario and of the
     object classes stays the same. The description contains the names of the scenario and of the object classes, but not

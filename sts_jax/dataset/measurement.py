@@ -97,7 +97,7 @@ def _measured(own: Measurement, data: Any, trajectories: np.ndarray, symmetries:
     if own.turn is None and any(symmetries):
         raise ValueError(
             f"measurement {own.name!r} has no function `turn`, which symmetries=True needs for the turned and mirrored "
-            "copies: give the measurement this function, or pass symmetries=False"
+            "copies of the trajectories: give the measurement this function, or pass symmetries=False"
         )
     values = _checked(own, "measure", own.measure(data, trajectories), len(trajectories))
     copies = [values]

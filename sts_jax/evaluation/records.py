@@ -125,7 +125,8 @@ class Metric:
         The argument of the function is the weight of each trajectory in the metric, `(n,)`.
 
         Args:
-            judged: The errors of the predictor and of the constant baseline, and the n true trajectories.
+            judged: The errors of the predictor, the errors of a constant baseline, and the n true trajectories. The
+                baseline always predicts the mean last frame of the training trajectories.
 
         Returns:
             The function, or None if the predictor does not predict the quantity that the metric measures.
@@ -147,5 +148,5 @@ class Column(NamedTuple):
 
 
 def mean(values: np.ndarray, weight: np.ndarray) -> float:
-    """The weighted mean, or nan if the sum of the weights is 0."""
+    """Return `sum(weight * values) / sum(weight)`, or nan if the sum of the weights is 0."""
     return float((weight * values).sum() / weight.sum()) if weight.sum() > 0 else float("nan")

@@ -134,7 +134,7 @@ class Capture:
             return None
 
     def release(self) -> None:
-        """Close the source."""
+        """Close the device, the stream or the video file."""
         self.properties.release()
 
 

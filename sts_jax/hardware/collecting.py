@@ -80,7 +80,7 @@ class Person(Protocol):
     def action(self) -> Action | None:
         """Return the next action of the person, or None if there is none.
 
-        The action refers to the view that was shown last.
+        The action refers to the `View` that was last passed to `show`.
         """
 
 

@@ -1,4 +1,4 @@
-"""`Captured`: one frame of a camera with its time and number. `CameraStatistics`: counts of all frames."""
+"""`Captured`: one frame of a camera with its time and number. `CameraStatistics`: counts of frames and other events."""
 
 import collections
 import dataclasses

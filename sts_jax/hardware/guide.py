@@ -268,7 +268,9 @@ def _clear(config: GuideConfig, state: State) -> State:
 
 
 def confirm(state: State) -> State:
-    """Advance the guide after the person has confirmed the current stage of recording a trajectory.
+    """Return the guide's next state after the person has confirmed the current stage of recording a trajectory.
+
+    The guide is the state machine that leads a person through the recording of trajectories.
 
     The meaning of a confirmation depends on the stage (`Stage`). In `CLEAR`, a confirmation means that the pad is
     empty. In `RELEASE`, it means that the object is released. In `REVIEW`, it means that the trajectory is good. In all

@@ -211,7 +211,7 @@ class Leds:
         return lit
 
     def ping(self) -> Lit:
-        """Ask the controller for the levels that are applied now.
+        """Ask the controller for the present levels of the four light channels, from 0 (off) to 255 (always on).
 
         Returns:
             The controller's answer.

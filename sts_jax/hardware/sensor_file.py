@@ -133,9 +133,9 @@ class Device:
 
     @property
     def exposures(self) -> tuple[float, float] | None:
-        """Exposure of the visual stream and exposure of the tactile stream, or None if one of the two is not set.
+        """Exposures of the visual and the tactile stream, in the unit of the camera's driver.
 
-        The unit is that of the camera's driver.
+        If either exposure is not set, the result is None instead of a tuple.
         """
         if self.exposure_visual is None or self.exposure_tactile is None:
             return None

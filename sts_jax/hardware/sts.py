@@ -224,7 +224,7 @@ class STS:
 
         After the lights are switched on or off, frames may still show the previous state of the lights for a short
         time. This time is the settling time. Even if the settling times were given, `connect` switches the lights on
-        and off. This provides one image of each stream, with which later images are compared.
+        and off. This provides a visual and a tactile image, with which later images are compared.
 
         Args:
             warmup_s: Time for the camera's automatic exposure and white balance to settle before they are locked (s).
@@ -505,8 +505,8 @@ def first_still(shots: Iterable[Shot], timeout_s: float, window_s: float) -> Sho
         window_s: Time during which the view must not change (s).
 
     Raises:
-        NotStillError: Before the view was still for `window_s` seconds, the limit `timeout_s` was exceeded or `shots`
-            ended.
+        NotStillError: The limit `timeout_s` was exceeded, or `shots` ended, before the view was still for `window_s`
+            seconds.
     """
     started_s: float | None = None
     first, look, change, allowed = None, None, 0.0, _STILL

@@ -29,7 +29,8 @@ def conv(
 
     Args:
         x: Images. Pixels outside their borders count as 0.
-        kernel: Weight for each kernel pixel, input channel and output channel. `size` must be a multiple of `stride`.
+        kernel: Weight for each kernel pixel, input channel and output channel. `size`, the height and width of the
+            kernel, must be a multiple of `stride`.
         stride: Step of the kernel from one output pixel to the next, in input pixels.
         padding: Number of zeros before the first and after the last pixel of each axis, at most `size - 1`.
 

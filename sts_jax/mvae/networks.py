@@ -289,7 +289,8 @@ class MVAE(nnx.Module):
 
         Args:
             name: Name of the modality.
-            z: Latents, each followed by the condition if the model has one, `(batch, latent + condition)`.
+            z: Latents, `(batch, latent + condition)`. If the model has a condition (known quantities, such as an
+                acceleration), its numbers are appended to each latent.
             weights: Weight of each sample in batch normalisation, `(batch,)`. With None, batch normalisation uses the
                 running statistics.
 

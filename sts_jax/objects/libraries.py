@@ -99,8 +99,8 @@ def library(
     if not items:
         reasons = "".join(f"\n  {name}: {reason}" for name, reason in skipped[:5])
         raise ValueError(
-            f"{folder}: the folder contains no usable mesh, and {len(skipped)} files were skipped: give a folder with "
-            f"mesh files that `objects.load` can read{reasons}"
+            f"{folder}: the folder contains no usable mesh (number of skipped files: {len(skipped)}): give a folder "
+            f"with mesh files that `objects.load` can read{reasons}"
         )
     if scale is not None or longest_side is not None:
         items = [dataclasses.replace(item, scale=scale, longest_side=longest_side, stated=None) for item in items]
@@ -242,7 +242,7 @@ def survey(collection: Library, *, progress: Callable[[str], None] | None = None
 
 
 def describe(entry: Entry) -> str:
-    """Describe a loaded item in one line of text, as in the listing of `survey`."""
+    """Describe size, faces and collision parts of a loaded mesh file in one line of text, as `survey` does."""
     return f"{entry.item.label}  {entry.item.name}: " + "; ".join([*facts(entry.body, entry.gaps), *entry.notes])
 
 

@@ -1,4 +1,4 @@
-"""Images of the view through the skin (visual stream): camera, rasteriser and shading. Also views from outside."""
+"""Camera, rasteriser and shading for images through the skin (visual stream) and for pictures from outside."""
 
 from sts_jax.optics.camera import Camera, full_window, object_window, rays, to_pixels
 from sts_jax.optics.external_view import photograph

@@ -43,7 +43,10 @@ class Freefall(Scenario):
     contact: Contact = dataclasses.field(default_factory=lambda: Contact(0.001, width=0.00005, rolling=0.002))
 
     def check(self) -> None:
-        """Raise a ValueError unless the scenario can be simulated."""
+        """Raise a ValueError if a field has a value of the wrong type or out of range. The message names the field.
+
+        For example, `frames` is too small if a trajectory ends before an object can fall and come to rest.
+        """
         super().check()
         check_length("height", self.height)
         check_length("spread", self.spread)

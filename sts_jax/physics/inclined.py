@@ -73,7 +73,7 @@ class Inclined(Scenario):
     by_contents: ClassVar[bool] = True
 
     def check(self) -> None:
-        """Raise a ValueError unless the scenario can be simulated."""
+        """Raise a ValueError if a field has a value of the wrong type or out of range. The message names the field."""
         super().check()
         if not 0 <= self.slope < math.pi / 2:
             raise ValueError(
@@ -96,7 +96,9 @@ class Inclined(Scenario):
             )
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-        """Draw one start uphill of the stop wall. See `Scenario.start` for the arguments.
+        """Draw one start: a pose uphill of the stop wall, at rest on the pad or in the air.
+
+        See `Scenario.start` for the arguments.
 
         For a start at rest, several random poses are drawn (the field `tries` is their number), and the best pose is
         used. In a good pose, the amount and the place of the object's contents decide whether the object tips or stays.

@@ -3,10 +3,10 @@
 The results have the same meaning as those of MJX (`physics.roll`). In this module, the state of one trajectory in
 MuJoCo is called a world.
 
-A tiny sphere at each vertex of the hull collides with the pad and the wall, so every vertex can be a contact point, as
-in `physics.contact`. Without these spheres, MuJoCo would keep only four contacts of a mesh that stands on a face, and a
-round base would act like a square base. The mesh itself also collides, because the rims of the pad and the wall touch
-the hull between its vertices.
+The pad and the stop wall (as in the scenario `Inclined`) are fixed boxes. A tiny sphere at each vertex of the object's
+hull collides with them, so every vertex can be a contact point, as in `physics.contact`. Without these spheres, MuJoCo
+would keep only four contacts of a mesh that stands on a face, and a round base would act like a square base. The mesh
+itself also collides, because the rims of the pad and the stop wall touch the hull between its vertices.
 """
 
 from collections.abc import Sequence
@@ -47,7 +47,10 @@ _WALL_SENSOR = '<contact geom1="wall" subtree2="object" reduce="netforce" data="
 
 
 class Ends(NamedTuple):
-    """Final values of n trajectories. The fields have the same meaning as the fields of `roll.State`."""
+    """State at the end of n trajectories, such as whether the object has left the pad (`gone`).
+
+    Each field has the same meaning as the field of the same name in `roll.State`.
+    """
 
     gone: Bool[np.ndarray, "n"]
     slow: Int[np.ndarray, "n"]
@@ -211,7 +214,8 @@ def roll(
             under constant gravity. It then keeps its pose and wrench, and its velocity becomes 0.
 
     Returns:
-        Final values of each trajectory, and one record per trajectory and frame.
+        Values at the end of each trajectory, such as whether the object has left the pad, and one record per trajectory
+        and frame.
     """
     count, frames, steps, _ = gravity.shape
     worlds = _simulation(models, points, start, gravity, np.zeros((count, 6)) if velocity is None else velocity)

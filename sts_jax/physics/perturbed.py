@@ -80,7 +80,7 @@ class Perturbed(Scenario):
     must_stand: ClassVar[bool] = True
 
     def check(self) -> None:
-        """Raise a ValueError unless the scenario can be simulated."""
+        """Raise a ValueError if a field has a value of the wrong type or out of range. The message names the field."""
         super().check()
         check_length("spread", self.spread)
         check_range("acceleration", self.acceleration, positive=False)
@@ -132,7 +132,7 @@ class Perturbed(Scenario):
         The outcome is the first of these that applies:
 
         - `FELL_OFF`, if the object has left the pad,
-        - `TOPPLES`, if its +z leans by more than 45 degrees from the vertical in the last frame,
+        - `TOPPLES`, if the z axis of its mesh leans by more than 45 degrees from the vertical in the last frame,
         - `SLIDES`, if it has moved by 10 mm or more along the pad,
         - `STANDS`, in all other cases.
         """

@@ -21,7 +21,10 @@ GONE_DEPTH = 0.01  # m, an object entirely this far below the gel's face has lef
 
 
 class State(NamedTuple):
-    """State of one trajectory. Each time step computes a new state from the previous one."""
+    """State of one trajectory: pose and velocity of the object, and counters such as the steps without contact.
+
+    Each time step computes a new state from the previous one.
+    """
 
     qpos: Float[Array, "7"]  # pose: position (m), quaternion
     qvel: Float[Array, "6"]  # m/s in the sensor frame, rad/s in the mesh frame (MuJoCo's free joint)

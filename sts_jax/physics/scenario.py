@@ -150,7 +150,7 @@ class Scenario(abc.ABC):
         """Draw the random start of one trajectory.
 
         Args:
-            key: Key for this draw alone.
+            key: Random key that is used for nothing else.
             shape: Geometry of the body.
             pad: Size of the pad along x and y (m).
 
@@ -265,7 +265,7 @@ class Scenario(abc.ABC):
         """Draw the hidden properties (friction, mass of the shell, and contents) of one trajectory.
 
         Args:
-            key: Key for this draw alone.
+            key: Random key that is used for nothing else.
         """
         fill, shell, friction, high, around = jax.random.split(key, 5)
 
@@ -419,8 +419,8 @@ def random_place(radius: PRNGKeyArray, angle: PRNGKeyArray, size: float) -> Floa
     """Draw x and y (m) uniformly from a disc about the pad's centre.
 
     Args:
-        radius: Key for the distance from the centre.
-        angle: Key for the direction.
+        radius: Random key for the distance from the centre.
+        angle: Random key for the direction.
         size: Radius of the disc (m).
     """
     r = size * jnp.sqrt(jax.random.uniform(radius))

@@ -116,9 +116,10 @@ def _xml(pad: tuple[float, float], wall: float, contact: Contact, shapes: list[s
 
 
 def compile_scene(parts: np.ndarray, pad: tuple[float, float], contact: Contact, wall: float = 0.0) -> mujoco.MjModel:
-    """Compile the scene for C MuJoCo. It has the pad, the stop wall and the object as a mesh.
+    """Compile the scene for C MuJoCo: the pad, a stop wall at one edge of the pad, and the object.
 
-    MuJoCo finds the contacts of the mesh. The object has placeholder mass properties, which `set_rigid` replaces.
+    The object has one mesh for each convex part, and MuJoCo finds the contacts of these meshes. The object has
+    placeholder mass properties, which `set_rigid` replaces.
 
     Args:
         parts: Points of the p convex parts that form the collision shape of the object, n points for each part,
@@ -218,7 +219,7 @@ def template(
 
 
 def drawn(model: mujoco.MjModel, like: mjx.Model) -> dict[str, np.ndarray]:
-    """Read fields of a model of C MuJoCo, namely those that `set_rigid` changes.
+    """Read the fields of a C MuJoCo model that `set_rigid` changes, such as `body_mass` and `geom_friction`.
 
     Args:
         model: Model of C MuJoCo.

@@ -1,4 +1,4 @@
-"""Interpolation between the corners of the face that is visible at each pixel."""
+"""Interpolation at each pixel between the values at the three corners of the face that is visible there."""
 
 import functools
 import operator
@@ -11,7 +11,10 @@ from sts_jax import optics
 
 
 class Corners(NamedTuple):
-    """Faces of an object, with the positions of their vertices in an image of the camera or in the gel's grid."""
+    """Faces of an object, with the positions of their vertices in a camera image or in the gel's grid.
+
+    The gel's grid is a regular grid of cells on the pad, in which the heights of the object above the gel are computed.
+    """
 
     column: Float[Array, "v"]  # columns of the vertices (pixels)
     row: Float[Array, "v"]  # rows of the vertices (pixels)

@@ -53,7 +53,8 @@ def of_items(config: Config, calibration: Calibration, present: dict[str, Bool[A
         config: Configuration of the model.
         calibration: Numbers for each subset of the inputs.
         present: Masks `(n,)` of the inputs by name. True means that the item has the input. An item with the input
-            `state` (the true pose, shape and mass) gets the value 1 for all numbers that correct the density.
+            `state` (the true pose, shape and mass) gets 1 for `outcome`, `weight` and `variance`, which leaves the
+            predicted density of its final pose unchanged.
 
     Returns:
         Numbers for each item, four arrays `(n,)`.

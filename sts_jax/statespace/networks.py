@@ -140,8 +140,9 @@ def _unfold(x: Float[Array, "n h w c"]) -> Float[Array, "n 2*h 2*w c//4"]:
 class Encoder(nnx.Module):
     """Estimates the state code (pose, shape and mass) and the appearance code from a visual or from a tactile image.
 
-    The first three numbers of the appearance code are the tint, which describes the mean colour of the object. In a
-    visual image, the tint is measured from the pixels. A tactile image does not determine the tint.
+    The appearance code describes all visible properties of the object other than its pose and shape. The first three
+    numbers of this code are the tint, which describes the mean colour of the object. In a visual image, the tint is
+    measured from the pixels. A tactile image does not determine the tint.
     """
 
     def __init__(self, config: Config, name: str, rngs: nnx.Rngs) -> None:
@@ -274,7 +275,9 @@ class Transition(nnx.Module):
 
 
 class Decoder(nnx.Module):
-    """Renders an object in a given pose, from its state code and its appearance code.
+    """Renders an object in a given pose, from its shape and its appearance code.
+
+    The shape is part of the state code. The appearance code describes all visible properties other than pose and shape.
 
     The network renders the object on a canvas: a square that is parallel to the pad and aligned with the object's
     heading. The heading is a direction parallel to the pad, and it turns with the object. The centre of the canvas is

@@ -1,8 +1,9 @@
 """The loss of a state-space model.
 
 A batch has the first and the last frames of some trajectories. The inputs are from the first frame. The targets
-are the true state in the first frame, and the images, the pose and the outcome of the last frame. The loss is the
-weighted sum of these terms. NLL is a negative log likelihood.
+are the true state in the first frame, and the images, the pose and the outcome of the last frame. The state code is a
+vector that describes the pose, the shape and the mass of the object. The appearance code describes all other visible
+properties. The loss is the weighted sum of these terms. NLL is a negative log likelihood.
 
 - `state` and `doubt`: the squared error of the state code that each encoder estimates, and the NLL by which the encoder
   learns the variance of this error
@@ -91,18 +92,25 @@ def fuse(found: dict[str, Gaussian], counts: dict[str, Bool[Array, "n"]]) -> Gau
         counts: A mask for each name in `found`, `(n,)`. True means that the item has the input.
 
     Returns:
-        The belief, a Gaussian over the state code and the appearance code, `(n, code + look)`.
+        The belief, a Gaussian over the state code (pose, shape and mass) and the appearance code (all other visible
+        properties), `(n, code + look)`.
     """
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *found.values())
     return product_of_experts(stacked, jnp.stack([counts[name] for name in found]))
 
 
 def of_state(belief: Gaussian) -> Gaussian:
-    """Remove the appearance code from a belief. The result is a belief about the state code alone, `(n, code)`.
+    """Remove the appearance code from a belief, which is a Gaussian over the state code and the appearance code.
+
+    The state code describes the pose, the shape and the mass of an object. The appearance code describes all other
+    visible properties.
 
     Args:
-        belief: Gaussian over two codes, `(n, code + look)`: the state code, whose length is `code`, and the appearance
-            code, whose length is `look`.
+        belief: Gaussian over both codes, `(n, code + look)`. The first `code` numbers are the state code, and the last
+            `look` numbers are the appearance code.
+
+    Returns:
+        Gaussian over the state code, `(n, code)`.
     """
     return Gaussian(belief.mean[:, : state.CODE], belief.log_var[:, : state.CODE])
 
@@ -209,6 +217,9 @@ def loss(
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
     """Compute the loss of one batch: a weighted sum of the terms that the docstring of the module defines.
 
+    A pose code is a scaled position and a rotation matrix. A state code describes the pose, the shape and the mass of
+    an object. An appearance code describes its other visible properties.
+
     Args:
         graphdef: Definition of the model, from `init`.
         params: Parameters of the model.
@@ -229,7 +240,7 @@ def loss(
             with the side `input_size`, and state codes `state` `(m, code)`. The model must have the input `visual`.
         falls: Trajectories without images: `state`, `pose` and `outcome` as in `targets` and, if the model has a
             condition, `condition`.
-        beta: Weight of the divergence of the appearance code.
+        beta: Weight of the Kullback-Leibler divergence of the appearance code from its prior.
 
     Returns:
         The loss, and its terms by name without their weights. A term that depends on inputs is a mean over the items
@@ -301,8 +312,8 @@ def rotation_between(code: Float[Array, "n code"], pose: Float[Array, "n 12"]) -
     """Compute the rotation matrices from the first to the final poses.
 
     Args:
-        code: State codes of the first frame, which begin with the pose codes.
-        pose: Pose codes of the last frame.
+        code: State codes (pose, shape and mass) of the first frame. They begin with the pose codes.
+        pose: Pose codes (position and rotation matrix) of the last frame.
 
     Returns:
         Matrices `R_final @ R_first.T`, which rotate vectors in the sensor frame.

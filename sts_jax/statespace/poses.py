@@ -95,7 +95,10 @@ def turn(angle: Float[Array, "*#n 2"], vector: Float[Array, "*#n 2"]) -> Float[A
 
 
 def turn_back(angle: Float[Array, "*#n 2"], vector: Float[Array, "*#n 2"]) -> Float[Array, "*#n 2"]:
-    """Rotate vectors (x, y) as `turn` does, but in the opposite direction. This is the inverse of `turn`."""
+    """Rotate vectors (x, y) in the plane of the pad by minus an angle. `turn_back(angle, turn(angle, v))` equals `v`.
+
+    `angle` has the cosine and the sine of each rotation angle.
+    """
     return turn(angle * jnp.array([1.0, -1.0]), vector)
 
 
@@ -117,7 +120,7 @@ def turn_code(angle: Float[Array, "*#n 2"], code: Float[Array, "*#n 12"]) -> Flo
 
 
 def turn_code_back(angle: Float[Array, "*#n 2"], code: Float[Array, "*#n 12"]) -> Float[Array, "*#n 12"]:
-    """Undo `turn_code`: rotate the scene about the z axis of the sensor frame by the negative angle."""
+    """Rotate pose codes about the z axis by the negative `angle`. This is the inverse of `turn_code`."""
     return turn_code(angle * jnp.array([1.0, -1.0]), code)
 
 
@@ -126,7 +129,8 @@ def turn_variance(angle: Float[Array, "*#n 2"], variance: Float[Array, "*#n 12"]
 
     Args:
         angle: Cosine and sine of the rotation angle.
-        variance: Variances of the numbers in the pose codes. The numbers are assumed to be independent.
+        variance: Variances of the 12 numbers in the pose codes (position and rotation matrix). The numbers are assumed
+            to be independent.
 
     Returns:
         Variances of the numbers after the rotation.

@@ -49,7 +49,8 @@ def sample(
         key: Random key for the samples.
         inputs: One or more inputs of n items, by name. `visual` and `tactile` are images in [0, 1],
             `(n, size, size, 3)`, where size is `Config.input_size`. `pose` contains pose codes, `(n, 12)`. `state`
-            contains true state codes, `(n, code)`. Inputs other than `state` must be in the model's `Config.inputs`.
+            contains true state codes (pose, shape and mass), `(n, code)`. Inputs other than `state` must be in the
+            model's `Config.inputs`.
         present: A mask for each name in `inputs`, `(n,)`. True means that the item has the input. Values of other items
             have no influence and may be NaN.
         empty: `visual` and `tactile` image of the empty sensor, `(size, size, 3)` in [0, 1].

@@ -64,7 +64,7 @@ def split(code: Float[Array, "n code"]) -> State:
 
 
 def join(state: State) -> Float[Array, "n code"]:
-    """Join the parts of n state codes, such as the pose and the mass, into n vectors.
+    """Join the parts of n state codes (pose, shape and mass, see `State`) into n vectors.
 
     This function is the inverse of `split`.
     """
@@ -77,7 +77,7 @@ def encode(
     mass: Float[Array, "n"],
     com: Float[Array, "n 3"],
 ) -> Float[Array, "n code"]:
-    """Encode the true poses, shapes and masses of n objects as state codes.
+    """Encode the true pose, shape and mass of each of n objects as a state code, which is one vector.
 
     Args:
         pose: Pose codes (position and rotation matrix), from `training.Preprocessing.encode_pose`.
@@ -87,7 +87,7 @@ def encode(
         com: Centres of mass in the mesh frame (m).
 
     Returns:
-        State codes, which are the concatenated parts of `State`.
+        State codes. A code consists of the fields of `State`, concatenated in their order.
     """
     own = (support / LENGTH - MEAN) @ _fit()
     rotation = poses.matrix(pose)
@@ -100,8 +100,10 @@ def encode(
 def turn(angle: Float[Array, "n 2"], state: State) -> State:
     """Compute the state codes of objects after a rotation of the whole scene about the z axis of the sensor frame.
 
+    A state code describes the pose, the shape and the mass of an object.
+
     Args:
-        angle: Cosine and sine of the rotation angle of each item.
+        angle: Cosine and sine of the rotation angle of each object.
         state: State codes before the rotation, split into their parts.
 
     Returns:
@@ -116,6 +118,8 @@ def turn(angle: Float[Array, "n 2"], state: State) -> State:
 
 def turn_variance(angle: Float[Array, "n 2"], variance: State) -> State:
     """Compute the variances of state codes after a rotation of the scene about the z axis of the sensor frame.
+
+    A state code consists of numbers that describe the pose, the shape and the mass of an object.
 
     Args:
         angle: Cosine and sine of the rotation angle of each item.
@@ -136,7 +140,7 @@ def reach(state: State, rotation: Float[Array, "n 3 3"]) -> Float[Array, "n"]:
     """Compute the height of the mesh origin above the lowest point of each object, after a rotation of the object.
 
     Args:
-        state: State codes before the rotation, split into their parts.
+        state: State codes (pose, shape and mass) before the rotation, split into their parts.
         rotation: Matrices of the rotation in the sensor frame.
 
     Returns:
@@ -156,7 +160,8 @@ def heading(state: State) -> Float[Array, "n 2"]:
     the heading.
 
     Args:
-        state: State codes, split into their parts. If the state codes are uncertain, pass their means.
+        state: State codes (pose, shape and mass), split into their parts. If the state codes are uncertain, pass their
+            means.
 
     Returns:
         Cosine and sine of the angle from the x axis of the sensor frame to the heading.

@@ -88,8 +88,7 @@ def cell_area(gel: Gel) -> Float[Array, ""]:
 def indent(gel: Gel, heights: Float[Array, "r c"]) -> Equilibrium:
     """Compute the pressure on the gel under an object that stays in its given pose.
 
-    The pressure is `p = k max(0, -h)`, with the stiffness k of the gel and the heights h. Depths are clipped to the
-    gel's thickness.
+    The pressure is `p = k min(max(0, -h), t)`, with the stiffness k and the thickness t of the gel, and the heights h.
 
     Args:
         gel: Constants of the gel.

@@ -1,4 +1,7 @@
-"""Fit the numbers that correct the predictions of a trained state-space model, on trajectories of new objects."""
+"""Fit the calibration of a trained state-space model, on trajectories of objects that it was not trained on.
+
+The calibration consists of numbers that correct the model's predictions, such as the probabilities of outcomes.
+"""
 
 import os
 from pathlib import Path

@@ -238,7 +238,7 @@ def _outcome_index(outcome: np.ndarray, scenario: physics.Scenario) -> np.ndarra
 def state_codes(
     preprocessing: Preprocessing, pose: np.ndarray, support: np.ndarray, mass: np.ndarray, com: np.ndarray
 ) -> np.ndarray:
-    """Encode the true states of objects for a state-space model.
+    """Encode the true pose, shape and mass of each of n objects as a state code, a vector for a state-space model.
 
     Args:
         preprocessing: Preprocessing of the model.
@@ -248,7 +248,7 @@ def state_codes(
         com: Centres of mass in the mesh frame, `(n, 3)` (m).
 
     Returns:
-        State codes, `(n, code)`, as from `statespace.encode`.
+        State codes, `(n, code)`. `statespace.state.State` describes the parts of a code.
     """
     encode = jax.jit(statespace.encode)
     parts = []

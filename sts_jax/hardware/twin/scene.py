@@ -134,7 +134,7 @@ class Picture(Scene):
         self._ends: tuple[Blender, Ends] | None = None
 
     def at(self, time_s: float) -> Seen:
-        """Return the same state for all times, see `Scene.at`."""
+        """Return the state of the scene, which is the same at all times. See `Scene.at` for the argument."""
         del time_s
         return Seen(Phase.STILL, 0, 0, None)
 
