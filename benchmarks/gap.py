@@ -13,10 +13,10 @@ default `WORKDIR`):
     python -m experiments.gap --real runs/gap-twin/device --sensor runs/gap-twin --simulated runs/gap-twin/clean
 
 The first two rows of the benchmark's table compare images that differ by chance only. The first row compares the two
-halves of the clean session. The second row compares two copies of the clean session with all default imperfections,
-which differ only in the random noise. Each further row compares the images of the clean session with the same images
-after a known change: one added imperfection or, in the last row, all default imperfections. The distances are the mean
-absolute error of the pixels, the energy distance of image features, and the accuracy of a classifier.
+halves of the clean session. For the second row, all default imperfections are added to two copies of the clean
+session, which then differ in the random noise only. Each further row compares the images of the clean session with the
+same images after a known change: one added imperfection or, in the last row, all default imperfections. The distances
+are the mean absolute error of the pixels, the energy distance of image features, and the accuracy of a classifier.
 """
 
 import contextlib

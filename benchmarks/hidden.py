@@ -302,8 +302,8 @@ def fill(learned: Lesson, items: list[objects.Body], starts: Starts, num: int, s
 def begun(study: Study, args: Args) -> tuple[list[objects.Body], Starts]:
     """Return the objects, and the initial states and outcomes of their trajectories.
 
-    With `--soaked`, the trajectories are loaded from that folder. Otherwise, they are simulated, unless the folder
-    `--keep` already contains them.
+    If `args.soaked` is a folder, the trajectories are loaded from this folder. Otherwise, they are simulated, unless
+    the folder `args.keep` already contains them.
     """
     if args.soaked is not None:
         starts = soak.soaked(args.soaked, args.scenario)

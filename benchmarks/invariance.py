@@ -1,6 +1,6 @@
 """Test whether shares of rest poses and outcomes change with half the time step, a mirrored scene, or C MuJoCo.
 
-    python -m benchmarks.invariance             # 4,000 runs per side, about 50 minutes on two idle cores
+    python -m benchmarks.invariance             # about 50 minutes on two idle cores
     python -m benchmarks.invariance --num 300   # about 5 minutes
     python -m benchmarks.invariance --only jerked-bottles
 
@@ -14,8 +14,8 @@ ways, which are called sides:
 - the same with start, jerk and object mirrored
 - the three sides above with C MuJoCo, instead of MJX, as the engine of `simulate`
 - "C MuJoCo": C MuJoCo with a plain model. The contacts are those that C MuJoCo finds for the mesh
-- "C, every vertex": C MuJoCo with a contact sphere at every vertex of the hull. The contacts that C MuJoCo finds for
-  the mesh act only where a rim of the pad presses against the hull between the vertices
+- "C, every vertex": C MuJoCo with a contact sphere at every vertex of the hull. The hull itself also has contacts, but
+  these act only where a rim of the pad touches the hull between the vertices
 - "C, every vertex, driven pad", for jerked bottles only: the same, but the pad is accelerated on slide joints under
   constant gravity. On all other sides, the pad is fixed and the jerk is a change of gravity
 

@@ -1,14 +1,14 @@
 """Skill of the state-space model for different numbers of training trajectories and of training steps.
 
-    python -m benchmarks.scaling runs/freefall --out scaling.png  # a run of --preset default, about 20 minutes
+    python -m benchmarks.scaling runs/freefall --out scaling.png                     # about 20 minutes
     python -m benchmarks.scaling runs/freefall --shares 1 --steps 1900 --seeds 1 2   # two more seeds show the spread
 
-The command uses the dataset of a run, and trains models in the folder `scaling` of the run. Some models are trained on
-a share of the training objects (`--shares`), with the largest number of steps in `--steps`. The other models are
-trained on all training objects, with each number of steps in `--steps`. Models that exist already in the folder are not
-trained again. The command prints the errors of the predictions for the held-out objects, and writes a plot of the
-visual skill with 95 % intervals to `--out`. The visual skill is a score of the predicted visual images. Perfect images
-have the skill 1, and the mean training image has the skill 0.
+The command uses the dataset of a run of an experiment (with `--preset default`), and trains models in the folder
+`scaling` of the run. Some models are trained on a share of the training objects (`--shares`), with the largest number
+of steps in `--steps`. The other models are trained on all training objects, with each number of steps in `--steps`.
+Models that exist already in the folder are not trained again. The command prints the errors of the predictions for the
+held-out objects, and writes a plot of the visual skill with 95 % intervals to `--out`. The visual skill is a score of
+the predicted visual images. Perfect images have the skill 1, and the mean training image has the skill 0.
 """
 
 import dataclasses

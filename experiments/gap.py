@@ -65,7 +65,7 @@ class Side:
     described: str  # description of the source
 
     def of(self, numbers: np.ndarray) -> "Side":
-        """Select the images of the trajectories with these numbers."""
+        """Select the images whose trajectory number is in `numbers`."""
         chosen = np.isin(self.images.group, numbers)
         return dataclasses.replace(self, images=gap.Streams(*(leaf[chosen] for leaf in self.images)))
 

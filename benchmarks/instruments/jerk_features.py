@@ -18,7 +18,10 @@ NOISE = 0.05  # standard deviation of the measured log mass, about 5 % of the ma
 
 
 class Sight(NamedTuple):
-    """Properties that follow from the visible shape, such as the mass at each fill level. One row for each object."""
+    """Properties computed from the shapes of objects, such as the mass if an object is empty or full.
+
+    Each array has one row for each object.
+    """
 
     profile: np.ndarray  # (b, 10) m: radius of the base, height, greatest radius, radii at seven heights
     low: np.ndarray  # (b,) m, height of the lowest point in the mesh frame
@@ -46,7 +49,7 @@ def look(body: objects.Body) -> tuple[np.ndarray, float, np.ndarray]:
 
 
 def sight(items: list[objects.Body]) -> Sight:
-    """Compute properties that follow from the visible shapes of objects, such as the mass at each fill level."""
+    """Compute properties from the shapes of objects, such as the mass if an object is empty, half full or full."""
     return Sight(*map(np.stack, zip(*map(look, items), strict=True)))
 
 

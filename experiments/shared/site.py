@@ -118,7 +118,7 @@ class Site(abc.ABC):
         return time.monotonic() - self._asked_s < _OPEN_S
 
     def asked(self) -> dict[str, Any]:
-        """Return the content of the page without the images (`facts`), and record the time of this request."""
+        """Return `facts`, the content of the page without the images, and record the time of this request."""
         self._asked_s = time.monotonic()
         return self.facts()
 

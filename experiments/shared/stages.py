@@ -258,7 +258,7 @@ def calibrate(job: Job, model: statespace.Config, folder: Path, config: Config, 
 
 
 def preprocessing_of(config: Config) -> training.Preprocessing:
-    """Make the preprocessing of the inputs from the configuration of an experiment."""
+    """Return the `training.Preprocessing` that belongs to the configuration of an experiment."""
     collection = config.collection
     small = (config.image_size, config.image_size)
     return training.Preprocessing(

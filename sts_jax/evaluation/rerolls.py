@@ -1,8 +1,8 @@
 """The ceiling: the best possible prediction of a last frame from the first pose.
 
-The ceiling is computed from re-rolls. A re-roll is another simulation that starts from the same first pose, with newly
-drawn hidden values. Hidden values are properties that a camera cannot see, such as the fill level and the friction. The
-condition (an input of some scenarios, such as an acceleration of the pad) is also the same in every re-roll.
+The ceiling is computed from re-rolls. A re-roll is another simulation of a trajectory, with the same first pose and the
+same condition (an input of some scenarios, such as an acceleration of the pad), but with newly drawn hidden values.
+Hidden values are properties that a camera cannot see, such as the fill level and the friction.
 """
 
 import concurrent.futures

@@ -81,7 +81,7 @@ class Images(NamedTuple):
 
 
 class Recordings:
-    """The confirmed trajectories of a session, as a sequence of `RecordedTrajectory` objects.
+    """The trajectories of a session that the user has confirmed, as a sequence of `RecordedTrajectory` objects.
 
     ```python
     for trajectory in hardware.load_recordings("runs/real/dataset"):
@@ -166,7 +166,7 @@ class Recordings:
 
 
 def load_recordings(folder: str | os.PathLike) -> Recordings:
-    """Return the confirmed trajectories of a session.
+    """Return the trajectories of a session that the user has confirmed (`Session.confirm`).
 
     A session is a folder of trajectories that were recorded with one sensor. The images of a trajectory are read when
     the trajectory is accessed. This function does not lock the session, so another process may add trajectories to it.

@@ -331,8 +331,8 @@ def _body(
         fault = "encloses no volume" if closed else "is not closed"
         if strict:
             raise ValueError(
-                f"{path}: the mesh {fault}: repair the mesh, or give strict=False. If the object is hollow, its "
-                "contents then fill the convex hull of the mesh"
+                f"{path}: the mesh {fault}: repair the mesh, or give strict=False. With strict=False, the contents of "
+                "a hollow object fill the convex hull of the mesh"
             )
         if holds:
             warnings.warn(

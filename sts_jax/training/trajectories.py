@@ -49,8 +49,8 @@ def frame_arrays(
     lacking = [own.name for own in measurements if own.name not in pairs.measurements]
     if lacking:
         raise ValueError(
-            f"pairs.measurements lacks {', '.join(lacking)}: call Dataset.pairs with the same argument `measurements` "
-            "as this function"
+            f"pairs.measurements lacks {', '.join(lacking)}: pass to Dataset.pairs the same argument `measurements` "
+            "that you pass here"
         )
     scales = tuple((own.name, float(own.scale)) for own in measurements if not own.is_image)
     preprocessing = dataclasses.replace(preprocessing, scales=scales)
@@ -93,7 +93,7 @@ def image_arrays(
     """
     found, shape = {"visual": visual, "tactile": tactile}, (2, *preprocessing.resolution, 3)
     if not modalities or not set(modalities) <= set(found):
-        raise ValueError(f"modalities must be {' or '.join(map(repr, found))} or both, got {modalities}")
+        raise ValueError(f"modalities must have one or both of 'visual' and 'tactile', got {modalities}")
     for name, images in found.items():
         if images.dtype != np.uint8 or images.shape != (len(visual), *shape) or not len(images):
             raise ValueError(

@@ -19,9 +19,8 @@ class Hand(AutomaticPerson):
     pose of the next trajectory. The trajectory without contact is not recorded, and its number stays unused in the
     session.
 
-    The session and the scene each give every trajectory a number. The two numbers of a trajectory are equal if the
-    scene starts to count at the number of the session's next trajectory
-    (`ObjectScene(first=hardware.next_recording(folder))`).
+    The session and the twin's scene each number the trajectories. The numbers agree if the first number of the scene is
+    the number of the session's next trajectory: `ObjectScene(first=hardware.next_recording(folder))`.
     """
 
     def __init__(self, twin: Twin, session: Session, *, patience_s: float = 60.0):

@@ -87,7 +87,7 @@ class Scene(abc.ABC):
 
         Args:
             command: `hold` holds an object on the pad, `release` lets it go, and `clear` takes it away.
-            blender: The twin's `Blender` instance. The method `Blender.ends` converts the rendered images.
+            blender: The twin's `Blender` instance, which converts the rendered images to linear light.
         """
 
     def command(self, command: str, time_s: float) -> None:
@@ -113,7 +113,7 @@ class Scene(abc.ABC):
         its virtual clock does not need the thread.
 
         Args:
-            blender: The twin's `Blender` instance. The method `Blender.ends` converts the rendered images.
+            blender: The twin's `Blender` instance, which converts the rendered images to linear light.
         """
 
     def close(self) -> None:  # noqa: B027, few scenes need it
