@@ -202,7 +202,7 @@ def measure(
 
 
 def describe(d: Difference) -> str:
-    """Format a `Difference` between rendered depth images and embree's as one row of the printed table."""
+    """Format the depth errors of rendered images as a row of the table. The reference is the ray tracer embree."""
     rest = max(d.elsewhere, 1)
     return (
         f"{d.interior:9} {100 * (1 - d.interior_beyond_10um / max(d.interior, 1)):9.4f} {d.interior_beyond_100um:7} "

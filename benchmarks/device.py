@@ -96,12 +96,13 @@ def serve(link: multiprocessing.connection.Connection, path: Path, lag_s: float,
 
     Args:
         link: Connection to the reading process. This function first sends the address of the camera. The reading
-            process then sends MOVE any number of times, to hold or release the twin's object, and FINISHED once. The
-            answer to FINISHED is the camera's log, which maps the key of each image to the light of its frame. The key
-            is the number of the frame, or for the twin a checksum of the pixels.
+            process then sends MOVE any number of times and FINISHED once. MOVE holds or releases the object of the
+            digital twin (a simulated sensor), and has no effect without the twin. The answer to FINISHED is the
+            camera's log. The log maps the key of each image to the mean light during the exposure (`Shown`). The key is
+            a checksum of the pixels with the twin, and the number of the frame without the twin.
         path: Path at which a symbolic link to the controller's port is created.
         lag_s: Time from the end of an exposure to the sending of the frame (s).
-        twin: Use images of the digital twin.
+        twin: True for images of the digital twin, a simulated sensor. False for images of one colour.
     """
     make: type[twin_peer.TwinPeer | sensor_peer.SensorPeer] = twin_peer.TwinPeer if twin else sensor_peer.SensorPeer
     peer = make(path, fps=FPS, lag_s=lag_s, exposure_s=EXPOSURE_S, size=SIZE)
@@ -120,7 +121,7 @@ def measure(lag_ms: float, pairs: int, path: Path, *, twin: bool) -> Measured:
         lag_ms: Time from the end of an exposure to the sending of the frame (ms).
         pairs: Number of pairs of a visual and a tactile image.
         path: Path at which a symbolic link to the controller's port is created.
-        twin: Use images of the digital twin.
+        twin: True for images of the digital twin, a simulated sensor. False for images of one colour.
     """
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()

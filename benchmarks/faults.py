@@ -376,10 +376,9 @@ def kill(bench: Bench, count: Count) -> None:
         _until(lambda: time.monotonic() > wait_s and lights.off_after(0.0) is None, 60)
         if process.poll() is not None or lights.off_after(0.0) is not None:
             raise RuntimeError(
-                "no light was on within 60 s, or the program that reads the sensor ended too early, so the benchmark "
-                "could not kill this program while a light was on. The exit status of the program is "
-                f"{process.poll()} (None: the program still runs). If the status is a number, see the program's error "
-                "output above"
+                "the benchmark could not kill the program that reads the sensor while a light was on, because the "
+                "program ended too early or no light was on within 60 s. The program's exit status (None: it still "
+                f"runs) is {process.poll()}. If the status is a number, see the program's error output above"
             )
         process.send_signal(signal.SIGKILL)
         process.wait()

@@ -79,7 +79,7 @@ def make(seed: int, imperfections: twin.Imperfections, lens: hardware.Lens | Non
 
 
 def read_pair(device: twin.Twin) -> tuple[hardware.Pair, tuple[float, ...]]:
-    """Take a visual and a tactile image of an object that does not move.
+    """Take a visual and a tactile image of an unmoving object, with a digital twin (a simulated sensor).
 
     Returns:
         The visual and the tactile image, and the object's pose (7 numbers) from the twin's log.
@@ -139,7 +139,7 @@ def recording(folder: Path, note: str) -> Iterator[hardware.Session]:
 
 
 def record(device: twin.Twin, folder: Path, count: int, note: str, bar: Bar) -> list[tuple[float, ...]]:
-    """Record trajectories of the twin.
+    """Record trajectories of a digital twin (a simulated sensor).
 
     A trajectory consists of two pairs of images. A pair is a visual and a tactile image. The first pair shows the held
     object, and the second pair shows the object at rest.
@@ -152,7 +152,7 @@ def record(device: twin.Twin, folder: Path, count: int, note: str, bar: Bar) -> 
         bar: Progress bar.
 
     Returns:
-        The poses (7 numbers) of all pairs, from the twin's log.
+        The pose of the object (7 numbers) for each pair, from the twin's log.
 
     Raises:
         ValueError: The folder has trajectories already.
@@ -184,8 +184,9 @@ def record(device: twin.Twin, folder: Path, count: int, note: str, bar: Bar) -> 
 def sessions(args: Args) -> hardware.Recordings:
     """Record the sessions `device` and `clean`, save the sensor file of `device`, and return the recordings of `clean`.
 
-    The twin of the session `device` has the default imperfections and a fisheye lens. The twin of the session `clean`
-    has almost no imperfections.
+    A session is a folder of images that a digital twin (a simulated sensor) has recorded. The twin of the session
+    `device` has the default imperfections and a fisheye lens. The twin of the session `clean` has almost no
+    imperfections.
 
     Raises:
         AssertionError: The poses of the object differ between the two sessions.
@@ -198,7 +199,8 @@ def sessions(args: Args) -> hardware.Recordings:
                 poses.append(record(device, args.workdir / name, args.trajectories, name, bar))
     if poses[0] != poses[1]:
         raise AssertionError(
-            f"the two twins have the seed {args.seed} but recorded different poses: delete {args.workdir} and run again"
+            f"the simulated sessions 'device' and 'clean' in {args.workdir} have the same seed ({args.seed}), but the "
+            f"poses of the object differ: delete {args.workdir} and run again"
         )
     hardware.Device(
         camera="http://127.0.0.1/camera",
@@ -228,7 +230,14 @@ class Difference:
 
 
 def levels(field: str, values: tuple[Any, ...]) -> list[Difference]:
-    """Create one `Difference` for each value of a field of `twin.Imperfections`. Other fields are as in `CLEAN`."""
+    """Make a list of changes to apply to clean images. Each change has another value of one imperfection of the camera.
+
+    Clean images are images of a digital twin that has almost no imperfections.
+
+    Args:
+        field: Field of `twin.Imperfections`, such as "vignetting". The other fields are as in `CLEAN`.
+        values: Values of the field, one for each change.
+    """
     return [Difference(f"{field} {value:g}", dataclasses.replace(CLEAN, **{field: value})) for value in values]
 
 

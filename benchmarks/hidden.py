@@ -13,11 +13,11 @@ object starts on a tilted pad or just above it. The parts are:
 - `outcomes`: the share of each outcome, and the share of the starts whose outcome changes if the hidden contents are
   replaced at random and all else stays the same. The random values are the fill level and, on the slope, also the side
   on which the contents lie.
-- `truth`: the log loss of two classifiers of the outcome. On the jerked pad, the inputs of the first classifier are the
-  exact shape, the first pose and the jerk. On the slope, the inputs are the exact shape and the first pose with the
-  noise of an estimate from images (`slope_features.SEEN`). The second classifier has a noisy measurement of touch as a
-  further input: the weight on the jerked pad, or the centre of pressure on the slope. The gain is the relative decrease
-  of the loss.
+- `truth`: the log losses of two classifiers of the outcome, and the gain, which is the relative decrease of the loss
+  from the first classifier to the second. On the jerked pad, the inputs of the first classifier are the exact shape,
+  the first pose and the jerk. On the slope, the inputs are the exact shape and the first pose with the noise of an
+  estimate from images (`slope_features.SEEN`). The second classifier has a noisy measurement of touch as a further
+  input: the weight on the jerked pad, or the centre of pressure on the slope.
 - `pictures`: as `truth`, but a small network estimates the measurement of touch from the first uint8 tactile image. The
   network is trained on other objects.
 - `fill`: the AUC of a small network that separates objects that are more than half full from emptier objects. The
@@ -283,7 +283,7 @@ def fill(learned: Lesson, items: list[objects.Body], starts: Starts, num: int, s
 
     The first network sees tactile images of standing objects. The second network sees visual images of objects in the
     air. The third network sees the same visual images, but with a tint on all objects that are more than half full.
-    The third case tests that the network detects a fill that is visible.
+    The result of the third network shows whether such a network detects a change that is visible.
 
     Args:
         learned: Training data, and the tactile images under study.

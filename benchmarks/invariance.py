@@ -1,4 +1,4 @@
-"""Test whether shares of rest poses and outcomes change with half the time step, a mirrored scene, or C MuJoCo.
+"""Test whether half the time step, a mirrored scene or C MuJoCo changes how often each rest pose or outcome occurs.
 
     python -m benchmarks.invariance             # about 50 minutes on two idle cores
     python -m benchmarks.invariance --num 300   # about 5 minutes
@@ -288,9 +288,9 @@ def named(case: Case, first: Array | np.ndarray, last: Array | np.ndarray) -> np
 
 
 def difference(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
-    """95 % interval of the difference between the shares of a label in two sets of runs.
+    """Compare the shares of runs with one label in two sets of runs, and return the 95 % interval of the difference.
 
-    A label names the state at the end of a run. Run i of the first set is paired with run i of the second set.
+    The label of a run names the state at its end. Run i of the first set is paired with run i of the second set.
 
     Args:
         a: True for the runs of the first set that have the label, `(n,)`.

@@ -4,10 +4,11 @@
 
 In the digital twin, a hand holds an object in an unstable pose and lets go. Each model predicts the images at rest from
 the images of the held object, as `experiments.live` does. The command prints the skill of the predicted images,
-computed from mean squared errors over all trajectories. The skill is 1 if the prediction is the true image, and 0 if
-the prediction is the mean of the images at rest of the other trajectories. No model was trained with the twin's noise,
-vignetting and leaking light. The twin's object moves as in the scenario `physics.Released`. Only the model `released`
-was trained on this scenario, with objects of the same class as the twin's object.
+computed from mean squared errors over all trajectories. The skill is 1 if the prediction of a trajectory is its true
+image at rest, and 0 if the prediction is the mean of the images at rest from all other trajectories. No model was
+trained with the twin's noise, vignetting and leaking light. The twin's object moves as in the scenario
+`physics.Released`. Only the model `released` was trained on this scenario, with objects of the same class as the twin's
+object.
 """
 
 import dataclasses
@@ -75,9 +76,10 @@ def seen(
     """Convert the visual or the tactile images of some pairs to inputs of a model.
 
     Args:
-        views: Conversion from raw images of the twin's camera to the view of the simulated pinhole camera.
+        views: Conversion from raw images of the digital twin (a simulated sensor) to the view of the pinhole camera
+            `Sensor.camera`.
         predictor: The model.
-        pairs: List of `n` pairs. A pair is a visual and a tactile image of the twin's camera.
+        pairs: List of `n` pairs. A pair is a visual and a tactile raw image of the digital twin.
         index: 0 for the visual stream, 1 for the tactile stream.
         size: Height and width of the result, divisors of the height and width of the model's inputs. Each pixel is the
             mean of a block of pixels. Default: the size of the model's inputs.
@@ -109,8 +111,8 @@ def skill(found: np.ndarray, truth: np.ndarray) -> float:
 def main(args: Args) -> None:
     """Record trajectories of the digital twin, and print a table with the skill of every model.
 
-    The skill is a score of the predicted images. Perfect images have the skill 1. The mean of the images at rest of the
-    other trajectories has the skill 0.
+    The skill is a score of the predicted images. It is 1 if each prediction is the true image at rest. It is 0 if the
+    prediction for each trajectory is the mean of the images at rest from all other trajectories.
 
     In the rows with `kept`, the images contain the background of the twin, such as its vignetting. In the rows with
     `divided out`, this background is replaced by the background of the model's training images (`hardware.relit`).

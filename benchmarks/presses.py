@@ -150,7 +150,7 @@ def pixels(presses: Presses, which: np.ndarray, *, every: int = 1, within: float
 
 
 def shader(unknowns: dict[str, Array], *, near: bool) -> tuple[tactile.Phong, tactile.Lights | tactile.Leds]:
-    """Convert the unbounded unknowns of the optimisation to constants and lights with values in the allowed ranges.
+    """Convert the unbounded unknowns of the optimisation to reflectance constants and lights within allowed ranges.
 
     Args:
         unknowns: The array `place`, `(m, 3)`, contains x and y of each light in mm, and the softplus inverse of the

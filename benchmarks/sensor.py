@@ -23,8 +23,8 @@ The first table has the frames per second. For each of the three ways, it also h
 seconds of `sense`, with the same number of threads.
 
 The second table has the share of each stage in the time of `sense`. At 640x480 it also has the speed relative to the
-code of the paper (Rezaei-Shoshtari et al. 2021). We once measured 0.40 s per frame for the renderer and the shader of
-this code on a CPU, without physics.
+code of the paper (Rezaei-Shoshtari et al. 2021). The renderer and the shader of the paper's code, without physics, took
+0.40 s per frame in a single measurement on a CPU.
 """
 
 import concurrent.futures
@@ -95,7 +95,10 @@ class Case(NamedTuple):
 
 
 class Durations(NamedTuple):
-    """Median seconds per frame, for whole frames and for parts of them."""
+    """Median seconds per frame of `sense` and of the ray tracer Embree.
+
+    The time of `sense` is measured for the whole frame and for some of its outputs, such as the depth.
+    """
 
     frame: float  # a whole frame
     gel: float  # balance of the gel alone
@@ -193,7 +196,7 @@ def embree(body: objects.Body, poses: jax.Array, shape: tuple[int, int]) -> dict
 
 
 def median_seconds(*works: Callable[[], object], repeats: int = 7) -> list[float]:
-    """Median seconds of each function. All functions are timed in turn, `repeats` times."""
+    """Median seconds of each function. The functions are called in alternation, `repeats` times each."""
     return np.median(in_turn(*works, repeats=repeats), axis=0).tolist()
 
 
@@ -255,8 +258,8 @@ def cases() -> Iterator[Case]:
 def measure(case: Case) -> Durations:
     """Measure the seconds per frame of `sense` and of the ray tracer Embree.
 
-    Both are measured in one thread and in as many threads as there are cores. On a GPU, `sense` is measured without
-    threads, for single frames and for a batch.
+    Both are measured in one thread, and also in as many threads as there are cores. On a GPU, a call that renders a
+    batch replaces the measurement of `sense` in several threads.
     """
     cores, on_cpu = os.cpu_count() or 1, jax.default_backend() == "cpu"
     pool = concurrent.futures.ThreadPoolExecutor(cores)
@@ -398,9 +401,9 @@ def cost_of(faces: int, height: int, width: int) -> dict[str, float]:
 
 
 def cost() -> None:
-    """Print the time and the peak memory to render a frame with several numbers of pixels and faces, and plot the time.
+    """Measure the time and the peak memory of rendering a frame, for several image sizes and numbers of faces.
 
-    Each combination is measured in a new process.
+    Each combination is measured in a new process. The results are printed, and the times are plotted.
     """
 
     def measured(faces: int, shape: tuple[int, int]) -> dict[str, float]:

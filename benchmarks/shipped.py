@@ -65,11 +65,10 @@ class Args:
 
 
 def collection(args: Args) -> dataset.Collection:
-    """Make the settings of a dataset for the test of `args.model`, with objects that no model was trained on.
+    """Make the settings of a dataset that tests the model `args.model` on objects that no model was trained on.
 
-    No model is trained on this dataset either. Its training split contains a fifth of the objects, and only defines the
-    baselines and the frequencies of the outcomes. The test split contains the other objects. The validation split is
-    empty.
+    The training split contains a fifth of the objects. It does not train a model, but only defines the baselines and
+    the frequencies of the outcomes. The test split contains the other objects. The validation split is empty.
     """
     return dataclasses.replace(
         EXPERIMENTS[args.model].COLLECTION,

@@ -90,7 +90,11 @@ def saturated(tactile: np.ndarray, blank: np.ndarray) -> np.ndarray:
 
 
 def main(args: Args) -> None:
-    """Fit a regression of the mass to tactile images. Print its R2 and error, and the share of saturated pixels."""
+    """Fit a regression that estimates the mass of an object from its tactile image, and print its accuracy.
+
+    The accuracy is the R2 and the standard deviation of the error for the logarithm of the mass of held-out objects.
+    The command also prints the share of imprint pixels that are saturated (value 0 or 255 in a channel).
+    """
     data = dataset.load(args.dataset)
     collection = dataset.Collection(num_objects=data.collection["num_objects"], seed=data.collection["seed"])
     bodies = dataset.make_bodies(collection, np.arange(collection.num_objects))

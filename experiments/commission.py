@@ -230,8 +230,8 @@ def live(config: Config, sensor: hardware.STS, pinhole: hardware.Pinhole) -> har
         CalibrationError: The pictures do not determine the lens or do not cover the view of the sensor, or the raw
             image does not contain the whole view. The view is the part of the gel's outer face that rectified images
             show. The message explains how to replace or add pictures.
-        ValueError: A picture of an earlier run has another size or cannot be read, or `every` is None and there is no
-            keyboard on which to press Enter.
+        ValueError: A picture of an earlier run has another size or cannot be read. The error is also raised if
+            `config.every` is None, so that each picture waits for the Enter key, and there is no keyboard.
     """
     folder, size = config.out / "board", (config.width, config.height)
     pictures = boards.Pictures.read(folder, config.board, size)
@@ -270,8 +270,8 @@ def claim_pictures(config: Config, camera: hardware.Camera) -> None:
     """Reserve the folder OUT/board for pictures from one camera, of one size and of one printed calibration board.
 
     Raises:
-        ValueError: The folder has pictures from another camera, of another size, or of another print of the board (the
-            option `--ruler`).
+        ValueError: The folder has pictures from another camera, of another size, or of a board with another value of
+            `--ruler`, the measured length of the printed 100 mm ruler.
     """
     made = {"camera": camera.source, "width": config.width, "height": config.height, "ruler": config.ruler}
     storage.claim(config.out / "board" / "camera.json", made)

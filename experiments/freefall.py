@@ -4,7 +4,7 @@
     python -m experiments.freefall --preset long      # 1.5 to 2.5 hours, can be stopped and started again
     python -m experiments.freefall --model paper      # the paper's four models instead of the state-space model
     python -m experiments.freefall --preset smoke     # about two minutes, for tests
-    python -m experiments.freefall --preset paper     # the paper's counts and schedule: hours, a GPU helps
+    python -m experiments.freefall --preset paper     # the paper's data size and training schedule: hours, a GPU helps
     python -m experiments.freefall --plan             # prints the expected seconds of each stage
 
 Results go to `runs/freefall/`: config.json, dataset/, models/NAME/, metrics.json, table.md and figures/*.png. A second

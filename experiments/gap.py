@@ -6,8 +6,8 @@
 
 `--real` and `--simulated` are folders of trajectories that `experiments.real collect` recorded. `--simulated` may also
 be the dataset of an experiment that was run with `--collection.no-crop`. Raw images are rectified with the lens of the
-sensor file. By default, trajectories of the same number must show the same object in the same poses. With
-`--match none`, the two folders show the same object in different poses.
+sensor file. By default, a real and a simulated trajectory with the same number must show the same object in the same
+poses. Give `--match none` if the two folders show the same object in different poses.
 
 The command prints differences per pixel, the distance between the distributions of real and simulated images in a
 feature space, and the accuracy of a classifier that tries to distinguish real from simulated images. The command

@@ -4,7 +4,7 @@
     python -m experiments.inclined --preset long      # at most 150 minutes, can be stopped and started again
     python -m experiments.inclined --model paper      # the paper's four models instead of the state-space model
     python -m experiments.inclined --preset smoke     # about two minutes, for tests
-    python -m experiments.inclined --preset paper     # the paper's counts and schedule: hours, a GPU helps
+    python -m experiments.inclined --preset paper     # the paper's data size and training schedule: hours, a GPU helps
     python -m experiments.inclined --plan             # prints the expected seconds of each stage
 
 Results go to `runs/inclined/`: config.json, dataset/, models/NAME/, metrics.json, table.md and figures/*.png. A second

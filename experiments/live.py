@@ -75,7 +75,10 @@ class Config:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Source:
-    """The source of the live images: a sensor, a digital twin or a recording. `follow` connects it."""
+    """The source of the live images: a sensor, a digital twin or a recording.
+
+    The function `follow` connects the sensor or the recording, and reads the images.
+    """
 
     name: str  # description for the title of the page
     sensor: hardware.STS | hardware.Replay  # device or recording
@@ -236,7 +239,10 @@ class Screen:
             print(", ".join([*lines(seen), *chances]), flush=True)
 
     def update(self) -> None:
-        """Update the page. The thread of the predictions calls this method, too."""
+        """Update the page.
+
+        The main thread calls this method after each image. The prediction thread calls it after each prediction.
+        """
         seen = self.seen()
         if self._page is not None and seen is not None:
             self._page.show(seen)

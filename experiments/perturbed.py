@@ -4,7 +4,7 @@
     python -m experiments.perturbed --preset long      # at most 150 minutes, can be stopped and started again
     python -m experiments.perturbed --model paper      # the paper's four models instead of the state-space model
     python -m experiments.perturbed --preset smoke     # about two minutes, for tests
-    python -m experiments.perturbed --preset paper     # the paper's counts and schedule: hours, a GPU helps
+    python -m experiments.perturbed --preset paper     # the paper's data size and training schedule: hours, a GPU helps
     python -m experiments.perturbed --plan             # prints the expected seconds of each stage
 
 A jerk is a short sideways acceleration of the pad. It is not a derivative of the acceleration.

@@ -4,7 +4,7 @@
     python -m experiments.released --preset long      # has not been run to the end yet, resumes after an interruption
     python -m experiments.released --model paper      # the paper's four models instead of the state-space model
     python -m experiments.released --preset smoke     # a few minutes, for tests
-    python -m experiments.released --preset paper     # the paper's counts and schedule: hours, a GPU helps
+    python -m experiments.released --preset paper     # the paper's data size and training schedule: hours, a GPU helps
     python -m experiments.released --plan             # prints the expected seconds of each stage
 
 The objects are small cameras (object class `camera`). This experiment is the simulated counterpart of the paper's real

@@ -26,7 +26,7 @@ from sts_jax.hardware import Lens, twin
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Options of the command line: the twin's camera, its object, and its serial port and HTTP server."""
+    """Options of the command line: camera, object, serial port and HTTP server of the twin (a simulated sensor)."""
 
     resolution: tuple[int, int] = (480, 640)  # height and width of the frames (pixels)
     rate: float = 30.0  # frame rate of the camera (frames/s)
@@ -99,7 +99,7 @@ def make(config: Config) -> twin.Twin:
 
 
 def main(config: Config) -> None:
-    """Serve the twin until Ctrl-C or SIGTERM.
+    """Let other programs use the twin (a simulated sensor) until Ctrl-C or SIGTERM.
 
     If `config.attached` is true, the end of the standard input also stops the twin.
     """

@@ -46,8 +46,8 @@ def checked_array(name: str, value: Any, wanted: str) -> np.ndarray | Array:
         raise ValueError(f"{name} is not an array ({error}): give an array of {wanted}.") from error
     if array.dtype.kind in "OUSMm":
         raise ValueError(
-            f"{name} is a {type(value).__name__}, and its NumPy dtype is {array.dtype}, but it must be an array of "
-            f"{wanted}."
+            f"{name} must be an array of {wanted}, got a value of type {type(value).__name__} that NumPy converts to "
+            f"the dtype {array.dtype}."
         )
     return array
 
@@ -86,8 +86,8 @@ def checked_masks(
         mask = checked_array(f"present[{name!r}]", value, "bool")
         if name not in arrays:
             raise ValueError(
-                f"present[{name!r}] is the mask of an input that was not given: the keys of present must be among "
-                f"{list(arrays)}."
+                f"present[{name!r}] is the mask of an input that was not given: give this input, or leave out its "
+                f"mask. The given inputs are {list(arrays)}."
             )
         if mask.shape != lead:
             raise ValueError(

@@ -21,8 +21,8 @@ def bilinear(
     """Interpolate an image at any points.
 
     Args:
-        image: Values of the pixels. There may be any number of axes *c for channels. If `wrap` is False, the image must
-            have at least 2x2 pixels.
+        image: Values of the pixels. The first two axes are the rows and the columns. Any number of channel axes may
+            follow. If `wrap` is False, the image must have at least 2x2 pixels.
         column: Columns of the points (pixels). The centre of a pixel has a whole number as its column.
         row: Rows of the points (pixels). The centre of a pixel has a whole number as its row.
         wrap: If True, the image repeats beyond its border. If False, a point outside has the value of the nearest point

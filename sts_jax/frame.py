@@ -197,7 +197,7 @@ def touch(
         Image in [0, 1]. If its shorter side has at least `Sensor.fine_below` pixels, it equals the image
         `Frame.tactile` that `sense` renders for the same imprint. For smaller images, `sense` samples more finely than
         `touch`. An invalid number in a traced `window` or in a traced constant of the sensor raises no error. Instead,
-        the image shows flat skin in the default window (`window=None`). If a constant is invalid, the image is also
+        the image shows flat skin in the default window (`window=None`). If a constant is invalid, this image is
         rendered with the default values of all traced constants.
 
     Raises:

@@ -51,7 +51,8 @@ def write_whole(path: Path, write: Callable[[Path], None]) -> None:
         temporary.replace(path)
     except OSError as error:
         raise OSError(
-            f"cannot write {path}: {error}. {remedy(error)}, then start again. All finished results are kept."
+            f"cannot write {path}: {error.strerror or error}. {remedy(error)}, then start again. All finished results "
+            "are kept."
         ) from error
     finally:
         with contextlib.suppress(OSError):
@@ -319,6 +320,6 @@ def write_folder(path: Path, files: dict[str, bytes]) -> None:
         temporary.rename(path)
         flush_folder(path.parent)
     except OSError as error:
-        raise OSError(error.errno, f"cannot write {path}: {error}. {remedy(error)}.") from error
+        raise OSError(error.errno, f"cannot write {path}: {error.strerror or error}. {remedy(error)}.") from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)

@@ -91,7 +91,7 @@ def test_an_experiment_trains_and_scores_a_further_modality(tmp_path):
     assert summary["MVAE with pose, from force"]["force_error"]["value"] > 0
     assert summary["VAE visual only, from visual"]["force_error"] is None
     assert "force error (N)" in (tmp_path / "table-full.md").read_text()
-    with pytest.raises(ValueError, match=r"measurements has .*mvae was trained with \['force'\]"):
+    with pytest.raises(ValueError, match=r"names in measurements are .*mvae was trained with \['force'\]"):
         stages.main(config, tmp_path, only="evaluate")
 
 

@@ -448,12 +448,15 @@ def test_a_traced_trajectory_prints_its_shapes(drops: physics.Trajectory) -> Non
         ({"pose": np.zeros((2, 7))}, r"start\.pose has quaternions whose length is not 1"),
         ({"pose": np.full((2, 7), np.nan)}, r"start\.pose has values that are not finite"),
         ({"condition": np.zeros((2, 1))}, r"start\.condition has shape \(2, 1\), but it must be \(2, 0\)"),
-        ({"held": np.array(-1)}, r"start\.held is -1, but it must be whole numbers of time steps >= 0"),
+        ({"held": np.array(-1)}, r"start\.held is -1, but each value must be an integer >= 0 \(time steps\)"),
         (
             {"held": np.zeros(3, int)},
             r"start\.held has shape \(3,\), but it must be one number or have the shape \(2,\)",
         ),
-        ({"carried": np.array(1.5)}, r"start\.carried has values from 1\.5 to 1\.5, but each must be from 0 to 1"),
+        (
+            {"carried": np.array(1.5)},
+            r"start\.carried has the smallest value 1\.5 and the largest value 1\.5, but each value must be",
+        ),
     ],
 )
 def test_errors_name_bad_starts(bodies: list[objects.Body], changed: dict, message: str) -> None:
@@ -475,7 +478,7 @@ def test_errors_name_bad_hidden_values(bodies: list[objects.Body]) -> None:
         physics.simulate(jax.random.key(0), bodies[0], Sensor(), SCENARIO, 2, hidden=good._replace(up=np.ones((2, 3))))
     with pytest.raises(ValueError, match=r"hidden.up has shape \(2, 2\)"):
         physics.simulate(jax.random.key(0), bodies[0], Sensor(), SCENARIO, 2, hidden=good._replace(up=np.eye(2)))
-    with pytest.raises(ValueError, match=r"hidden.fill has values from 0.0 to 1.5"):
+    with pytest.raises(ValueError, match=r"hidden.fill has the smallest value 0.0 and the largest value 1.5"):
         physics.simulate(
             jax.random.key(0), bodies[0], Sensor(), SCENARIO, 2, hidden=good._replace(fill=np.array([0, 1.5]))
         )

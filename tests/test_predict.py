@@ -367,7 +367,7 @@ POSE = measurement()["pose"]
         ({"pose": POSE, "present": [True]}, "present is a list"),
         ({"pose": POSE, "present": {"pose": 1.0}}, r"present\['pose'\] has dtype float64, but it must"),
         ({"pose": POSE, "present": {"pose": "yes"}}, r"present\['pose'\] is 'yes'"),
-        ({"pose": POSE, "present": {"sound": True}}, r"present\['sound'\].*must be among \['pose'\]"),
+        ({"pose": POSE, "present": {"sound": True}}, r"present\['sound'\].*given inputs are \['pose'\]"),
         ({"pose": POSE, "condition": "fast"}, "condition is 'fast'"),
         ({"pose": np.tile(POSE, (2, 3, 1)), "visual": np.zeros((3, 2, SIDE, SIDE, 3))}, "the leading axes differ"),
         ({"pose": np.tile(POSE, (2, 3, 1)), "visual": np.zeros((3, SIDE, SIDE, 3))}, "the leading axes differ"),

@@ -73,10 +73,10 @@ def gain(before: np.ndarray, after: np.ndarray, weight: np.ndarray) -> float:
 
 
 def kept(before: np.ndarray, after: np.ndarray, other: np.ndarray, weight: np.ndarray) -> float:
-    """Ratio of two gains, `gain(before, other, weight) / gain(before, after, weight)`.
+    """Ratio of the gains of two classifiers, `gain(before, other, weight) / gain(before, after, weight)`.
 
-    A gain is the relative decrease of the weighted mean loss. The losses `before`, `after` and `other` and their
-    weights have the shape `(n,)`.
+    A gain is the relative decrease of the weighted mean loss. `after` and `other` are the losses of the two
+    classifiers, and `before` is the loss of a baseline. All losses and weights have the shape `(n,)`.
     """
     return gain(before, other, weight) / gain(before, after, weight)
 

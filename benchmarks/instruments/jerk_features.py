@@ -18,9 +18,10 @@ NOISE = 0.05  # standard deviation of the measured log mass, about 5 % of the ma
 
 
 class Sight(NamedTuple):
-    """Properties computed from the shapes of objects, such as the mass if an object is empty or full.
+    """Properties computed from the shapes of objects.
 
-    Each array has one row for each object.
+    The field `rigid` has the mass properties of each object at 17 fill levels of its interior, from empty to full. Each
+    array has one row for each object.
     """
 
     profile: np.ndarray  # (b, 10) m: radius of the base, height, greatest radius, radii at seven heights
@@ -31,11 +32,11 @@ class Sight(NamedTuple):
 
 
 def look(body: objects.Body) -> tuple[np.ndarray, float, np.ndarray]:
-    """Compute properties of one object's visible shape: its row in each field of `Sight`.
+    """Compute the properties of one object that `Sight` contains for several objects.
 
     Returns:
-        Profile (radii and height), height of the lowest point in the mesh frame, and mass properties at each fill
-        level. `Sight` gives their shapes and units.
+        Profile (radii and height), height of the lowest point in the mesh frame, and mass properties for each value of
+        `FILLS`, the share of the object's interior that is filled. `Sight` gives their shapes and units.
     """
     points = np.asarray(body.vertices)[np.unique(np.asarray(body.faces))]
     low = float(points[:, 2].min())
@@ -49,7 +50,7 @@ def look(body: objects.Body) -> tuple[np.ndarray, float, np.ndarray]:
 
 
 def sight(items: list[objects.Body]) -> Sight:
-    """Compute properties from the shapes of objects, such as the mass if an object is empty, half full or full."""
+    """Compute properties from the shapes of objects, such as the mass of each object when empty and when full."""
     return Sight(*map(np.stack, zip(*map(look, items), strict=True)))
 
 

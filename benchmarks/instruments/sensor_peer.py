@@ -37,7 +37,7 @@ class Lights:
             self._changes.append((time.monotonic(), sum(levels) / 1020))
 
     def shares(self, start_s: float, end_s: float) -> tuple[list[float], float]:
-        """Find the light during an interval.
+        """Return the levels of the emulated light during an interval.
 
         Args:
             start_s: Start of the interval on `time.monotonic` (s).
@@ -58,9 +58,9 @@ class Lights:
         return found, mean
 
     def off_after(self, time_s: float) -> float | None:
-        """Return None if the lights are on now. Otherwise, return `max(time_s, t)`, where t is the time they went off.
+        """Return the time at which the lights went off, or `time_s` if `time_s` is later.
 
-        All times are in seconds on `time.monotonic`.
+        Return None if the lights are on now. All times are in seconds on `time.monotonic`.
         """
         with self._lock:
             since_s, share = self._changes[-1]

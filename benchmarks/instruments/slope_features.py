@@ -134,9 +134,10 @@ def laid(scenario: physics.Inclined, items: list[objects.Body], starts: Starts, 
     The objects may have any shape. The features include the probabilities of tipping, sliding and sticking. A
     probability is the weighted share of the predictions of `balance` for `DRAWS` random draws of the hidden contents,
     each combined with `FRICTIONS` coefficients of friction. From vision alone, all predictions have equal weights. With
-    touch, the weight of a prediction is the likelihood of the measured centre of pressure. Noise with the standard
-    deviations `SEEN` is added to the pose. An exact pose would reveal which objects have already slipped by some
-    micrometres.
+    touch, the weight of a prediction is the likelihood of the measured centre of pressure.
+
+    Noise with the standard deviations `SEEN` is added to the pose in the first frame. Some objects have slipped by some
+    micrometres before this frame, and an exact pose would reveal the slip to the classifier.
 
     Args:
         scenario: The scenario.

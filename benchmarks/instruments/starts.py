@@ -38,7 +38,7 @@ class Starts(NamedTuple):
 
 
 def bodies(categories: tuple[str, ...], count: int, first: int = 0) -> list[objects.Body]:
-    """Make objects of the given classes, such as "bottle", in turn.
+    """Make objects of the given classes, such as "bottle". The classes alternate from object to object.
 
     Args:
         categories: Names of the classes.

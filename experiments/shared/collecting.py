@@ -241,7 +241,7 @@ class AutomaticPage(AutomaticPerson):
         self._page = page
 
     def show(self, view: View) -> None:
-        """Show the images and the instruction of a view in all open pages."""
+        """Update all open pages with the images and the instruction in `view`."""
         super().show(view)
         self._page.show(view)
 

@@ -142,10 +142,9 @@ def configure(args: Args) -> Config:
         collection = with_meshes(collection, args.objects, args.workdir, args.classes, scale=args.scale, up=args.up)
     elif args.classes:
         collection = dataclasses.replace(collection, categories=tuple(dict.fromkeys(args.classes)))
-    if collection.meshes is None:
-        for category in collection.categories:
-            sts.objects.find_family(category)
-    return dataclasses.replace(args.config, collection=collection)
+    config = dataclasses.replace(args.config, collection=collection)
+    check(config)
+    return config
 
 
 def with_meshes(

@@ -1,10 +1,15 @@
 """The configuration of an experiment, and its presets."""
 
 import dataclasses
+import itertools
 from pathlib import Path
 from typing import Literal
 
-from sts_jax import dataset, statespace, training
+import numpy as np
+
+import sts_jax as sts
+from sts_jax import dataset, evaluation, statespace, training
+from sts_jax.dataset.collection import PARTS
 from sts_jax.training import TrainConfig
 
 # The models of each kind and their modalities. The first model of a kind is the main one, which the tables and figures
@@ -140,8 +145,9 @@ def check(config: Config) -> None:
         ValueError: A field is out of range, or two fields contradict each other. The message names the remedy.
     """
     collection, names = config.collection, tuple(MODELS["paper"])
+    collection.check(sts.Sensor())
     height, width = collection.resolution
-    if height != width or height < 1:
+    if height != width:
         raise ValueError(
             f"collection.resolution must be square, got {height} x {width}: give --collection.resolution {height} "
             f"{height}"
@@ -161,8 +167,8 @@ def check(config: Config) -> None:
         listed, nearest = ", ".join(map(str, allowed)), min(allowed, key=lambda size: abs(size - config.image_size))
         raise ValueError(
             f"image_size must be one of {listed} for collection.resolution {height} {width} and model "
-            f"{config.model!r}, got {config.image_size}: give --image-size {nearest}, or choose another resolution and "
-            "image size. The resolution must be a multiple of the image size"
+            f"{config.model!r}, got {config.image_size}: give --image-size {nearest}, or choose another resolution, "
+            "and an image size that divides the resolution"
         )
     if config.model == "paper" and config.steps is not None and len(config.steps) != len(names):
         raise ValueError(
@@ -186,10 +192,42 @@ def check(config: Config) -> None:
             f"splits must be one or more of {', '.join(SPLITS)}, got {config.splits}: give --splits "
             f"{SPLITS[0]}, for example"
         )
+    for split in config.splits:
+        _check_parts(collection, split)
+
+
+def _check_parts(collection: dataset.Collection, split: str) -> None:
+    """Raise a `ValueError` unless each part of a split of the dataset contains at least one object or trajectory."""
+    shares, count = np.array(collection.shares), collection.num_objects
+    parts, items, few = PARTS, "objects", f"collection.num_objects is {count}"
+    if split == "trajectory":
+        rest = evaluation.train_share(collection.shares, split)
+        shares, count = np.array([rest, 1 - rest]), count * collection.rendered_per_object
+        parts, items = ("train", "test"), "trajectories"
+        few = f"the number of trajectories with images is {count}"
+    empty = [name for name, size in zip(parts, _sizes(shares, count), strict=True) if size < 1]
+    if not empty:
+        return
+    if min(shares) <= 0:
+        raise ValueError(
+            f"collection.shares must be > 0 for {', '.join(parts)}, got {collection.shares}: give "
+            "--collection.shares 0.7 0.1 0.2, for example"
+        )
+    least = next(n for n in itertools.count(count + 1) if min(_sizes(shares, n)) >= 1)
+    raise ValueError(
+        f"{few}, so the part {empty[0]!r} of the split by {split} has no {items}. With collection.shares "
+        f"{collection.shares}, at least {least} {items} are needed: raise --collection.num-objects, or give other "
+        "--collection.shares"
+    )
+
+
+def _sizes(shares: np.ndarray, count: int) -> np.ndarray:
+    """The numbers of items in the parts of a split of `count` items."""
+    return np.diff(np.round(np.cumsum([0, *shares]) * count)).astype(int)
 
 
 def image_sizes(config: Config) -> tuple[int, ...]:
-    """The values of `image_size` that the model and the resolution of the collection allow, in pixels."""
+    """The values of `image_size` that the model and the resolution of the collected images allow, in pixels."""
     side = config.collection.resolution[0]
     return tuple(size for size in range(SMALLEST, side + 1) if side % size == 0 and _fits(config.model, side, size))
 

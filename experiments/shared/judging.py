@@ -62,7 +62,8 @@ def evaluate(
         The main table in Markdown.
 
     Raises:
-        ValueError: `own.measurements` differs from the further modalities with which the main model was trained.
+        ValueError: The names of `own.measurements` differ from those with which the model of the main table was
+            trained. A measurement is a modality besides images and pose, such as the contact force.
     """
     suffix = "" if split == config.splits[0] else f"-by-{split}"
     done, figures = workdir / f"metrics{suffix}.json", workdir / f"figures{suffix}"
@@ -134,8 +135,8 @@ def _check_measurements(folder: Path, own: Extensions) -> None:
     given = sorted(measurement.name for measurement in own.measurements)
     if given != trained:
         raise ValueError(
-            f"measurements has {given}, but the model in {folder} was trained with {trained}: pass the same "
-            "Extensions(measurements=...) as for the training, or train the model again in a new work directory"
+            f"the names in measurements are {given}, but the model in {folder} was trained with {trained}: pass the "
+            "same Extensions(measurements=...) as for the training, or train the model again in a new work directory"
         )
 
 
@@ -199,8 +200,8 @@ def _scored(
 def main_rows(model: str, titles: Sequence[str]) -> list[str]:
     """Titles of the rows of the main table: ceiling, baselines, and the main model with up to five sets of inputs.
 
-    The ceiling is the score of the mean result of re-rolls. A re-roll is another simulation from the same initial
-    state, with new random hidden properties such as friction.
+    The row of the ceiling has the scores of a prediction that averages over re-rolls. A re-roll is another simulation
+    from the same initial state, with new random hidden properties such as friction.
 
     Args:
         model: Title of the main model.

@@ -41,7 +41,7 @@ class OwnTwin:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop the thread that `start` started. The twin itself keeps running."""
+        """Stop the thread that holds and releases the simulated object. The digital twin itself keeps running."""
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join()

@@ -34,7 +34,7 @@ class Page(Site):
         super().__init__(host, port, _PAGE, _STREAMS)
 
     def show(self, view: View) -> None:
-        """Update all open pages with the images and the instruction of a view."""
+        """Update all open pages with the images and the instruction in `view`."""
         with self._changed:
             self._view, self._number = view, self._number + 1
             self._changed.notify_all()

@@ -13,9 +13,9 @@ from sts_jax import dataset, evaluation
 def draw_strip(path: Path, collection: dataset.Collection, sensor: sts.Sensor, data: dataset.Dataset) -> None:
     """Draw a trajectory of a dataset as a strip of pictures.
 
-    The drawn trajectory is fully rendered, which means that the dataset has images of each of its frames. If there are
-    several such trajectories, the function draws the first one that has the earliest outcome in the list
-    `collection.scenario.outcomes`.
+    The drawn trajectory is fully rendered, which means that the dataset has images of each of its frames. Among several
+    such trajectories, the function chooses those whose outcome comes first in the list `collection.scenario.outcomes`.
+    Among these, it draws the one with the smallest index.
 
     Args:
         path: Path of the picture.

@@ -48,8 +48,8 @@ def ceilings(
 
     A re-roll is a new simulation from the first pose of a trajectory, with newly drawn hidden properties such as
     friction. The re-rolls and their scores are in `ceiling{suffix}.npz`. `ceiling{suffix}.json` records the checksums
-    of the inputs of the computation. If an input has changed, the re-rolls are computed again. The code of a metric has
-    no checksum. After a change of this code, delete the two files.
+    of the inputs of the computation. If an input has changed, the re-rolls are computed again. The checksums do not
+    cover the source code that computes the metrics. If you change this source code, delete both files.
 
     Args:
         workdir: Work directory.

@@ -123,7 +123,7 @@ def lens(config: Simulated, sensor: sts.Sensor) -> hardware.Lens:
 
 @contextlib.contextmanager
 def started(config: Simulated, first: int) -> Iterator[twin.Twin]:
-    """Start a twin, and close it at the end of the `with` block.
+    """Start a twin, which is a simulated sensor, and close it at the end of the `with` block.
 
     The twin simulates a fixed sequence of trajectories for each seed. Its next trajectory is number `first` of this
     sequence.
@@ -143,8 +143,9 @@ def started(config: Simulated, first: int) -> Iterator[twin.Twin]:
 
 
 def commissioned(config: Simulated, device: twin.Twin) -> tuple[twin.VirtualSensor, EmptyPad]:
-    """Make the `VirtualSensor` that reads images of the twin, and the `EmptyPad` that describes its empty pad.
+    """Make a `VirtualSensor` and an `EmptyPad` for a digital twin of the sensor.
 
+    The `VirtualSensor` reads images of the twin. The `EmptyPad` describes the images of the twin's empty pad.
     Both are made from the sensor file. If the work directory has no sensor file, `commission` writes it first. The
     `VirtualSensor` gets the settling times of the file, which are the waiting times after the LEDs are switched. The
     `EmptyPad` is computed from the background images that the file names.

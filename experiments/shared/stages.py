@@ -38,7 +38,8 @@ def main(config: Config, workdir: Path, *, only: Stage | None = None, own: Exten
     if own.measurements and config.model != "paper":
         raise ValueError(
             f"measurements must be empty for model={config.model!r}, got the modality {own.measurements[0].name!r}: "
-            "remove it, or use model='paper', because only the paper's model with all modalities accepts further ones"
+            "remove it, or use model='paper', because only the paper's model `mvae` accepts modalities in addition to "
+            "visual, tactile and pose"
         )
     sensor = sts.Sensor()
     with storage.lock(workdir):
@@ -218,9 +219,10 @@ def run(
     Args:
         job: Model and data.
         folder: Folder of the model.
-        targets: Modalities that a model of the paper learns to predict from a subset of its inputs. "all": all
-            modalities. "own": only the modalities of the subset.
-        progress: Function that receives the number of finished steps, the number of all steps, and values of the log.
+        targets: For the paper's models: modalities to predict from each subset of the inputs. "all": all modalities.
+            "own": only the modalities in the subset. Ignored for the state-space model.
+        progress: Function that is called after every step with the number of finished steps, the number of all steps,
+            and the latest record of `metrics.jsonl` (empty before the first record).
         own: Your own loss, optimiser and logger.
     """
     training.save_blank(folder, job.empty["visual"], job.empty["tactile"])

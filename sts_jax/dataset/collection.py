@@ -59,7 +59,7 @@ class Collection:
         return math.ceil(self.num_objects / self.objects_per_shard)
 
     def check(self, sensor: Sensor) -> None:
-        """Raise an error if a field is invalid, or if the sensor does not suit the collection.
+        """Raise an error if a field of the collection or of its scenario is invalid, or if the sensor does not suit.
 
         Args:
             sensor: The sensor. Its pad must be square if `symmetries=True` and the scenario allows quarter turns.
@@ -68,6 +68,7 @@ class Collection:
             ValueError: A field is out of range, a name in `categories` is unknown, or the pad of the sensor is not
                 square although the collection needs a square pad. The message names the field.
         """
+        self.scenario.check()
         sides = [float(side) for side in sensor.gel.size]
         quarter_turns = any(symmetry % 2 for symmetry in symmetries_of(self))
         if quarter_turns and sides[0] != sides[1]:
@@ -89,7 +90,10 @@ class Collection:
             raise ValueError("categories is empty, but it must name at least one class, such as 'bottle'")
         for category in self.categories if self.meshes is None else ():
             objects.find_family(category)
-        for name, least in (("num_objects", 1), ("num_per_object", 1), ("objects_per_shard", 1), ("num_full", 0)):
+        for name, least in (
+            *(("num_objects", 1), ("num_per_object", 1), ("objects_per_shard", 1)),
+            *(("num_full", 0), ("num_views", 0), ("seed", 0)),
+        ):
             value = getattr(self, name)
             if not (type(value) is int and value >= least):
                 raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
@@ -101,8 +105,6 @@ class Collection:
                 f"num_rendered must be a whole number from 1 to num_per_object={most}, or None for all, "
                 f"got {rendered!r}"
             )
-        if not (type(self.num_views) is int and self.num_views >= 0):
-            raise ValueError(f"num_views must be a whole number of at least 0, got {self.num_views!r}")
 
 
 def class_names(collection: Collection) -> tuple[str, ...]:

@@ -145,7 +145,7 @@ class Camera:
 
     @property
     def locked(self) -> dict[str, float]:
-        """The locked settings of a device and the values of these settings, such as {"exposure": 200.0}.
+        """The settings of a device that are locked at fixed values, and these values, such as {"exposure": 200.0}.
 
         The keys are field names of `CameraConfig`. For streams and files, the result is empty.
         """

@@ -135,7 +135,7 @@ class Pace:
         self._gap = gap._replace(frames=frames, missing=missing) if missing and frames < gap.limit else None
 
     def interrupted(self) -> None:
-        """Exclude the interval before the next frame from the measured period and from the count of lost frames.
+        """Ignore the interval before the next frame when measuring the frame period and counting lost frames.
 
         Call this method after an interruption of the connection. The next frame counts as delayed, because it may have
         waited in a buffer while the connection was opened.

@@ -1,4 +1,7 @@
-"""`ProvenFrames`: takes camera frames for which the LED controller has confirmed that the lights did not change."""
+"""`ProvenFrames`: takes camera frames, and ensures that the lights did not change during their exposure.
+
+After each frame, the LED controller must confirm that the lights have not changed since they were last switched.
+"""
 
 import contextlib
 import time

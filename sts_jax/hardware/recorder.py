@@ -5,8 +5,8 @@ A recording is a folder:
     recording.json    version of the format, encoding, and identity of the sensor
     visual.mkv        images without light, as a Matroska video that other programs can play
     tactile.mkv       images with light, as a Matroska video
-    frames.jsonl      one line for each image: its time, its position in the video file, and the times before and after
-                      its exposure between which the lights did not change
+    frames.jsonl      one line for each image: its time, its position in the video file, and the start and the end of a
+                      time interval that contains the exposure, and in which the lights did not change
     sensor.json       only if a sensor file was given: a copy of this file. Its background images are copied too
 
 Each image is written before its line in frames.jsonl. After an interruption at any time, each complete line therefore
@@ -196,7 +196,8 @@ class Recorder:
                 raise
         except OSError as error:
             raise OSError(
-                f"cannot write {path}: {error}. {storage.remedy(error)}. Everything that was recorded before is kept."
+                f"cannot write {path}: {error.strerror or error}. {storage.remedy(error)}. Everything that was "
+                "recorded before is kept."
             ) from error
         return before + len(data)
 

@@ -116,8 +116,8 @@ def switched_share(look: Thumbnail, before: Thumbnail, change: Thumbnail) -> flo
     Args:
         look: Thumbnail of the image.
         before: Thumbnail of an image before the switch.
-        change: Effect of a complete switch: an earlier thumbnail with the lights after the switch, minus an earlier
-            thumbnail with the lights before the switch.
+        change: Effect of a complete switch on a thumbnail, from two earlier images. It is the thumbnail with the new
+            state of the lights minus the thumbnail with the old state.
 
     Returns:
         0 if the image shows the lights before the switch, and 1 if it shows the lights after the switch. The result is
@@ -137,7 +137,7 @@ def settling(on: Sequence[Switch], off: Sequence[Switch], period_s: float) -> Se
     The `light_share` of a frame is 0 if the lights are off and 1 if they are on. A frame is settled if its
     `light_share` differs by at most 0.02 from the `light_share` of the last frame in the same `Switch`. The delay of a
     frame is its time of arrival after the controller's acknowledgement. A settling time is the largest delay of a frame
-    that is not settled, plus `period_s`. It is computed separately from the frames in `on` and from those in `off`.
+    that is not settled, plus `period_s`. One settling time is computed from `on`, and another from `off`.
     `period_s` is added because a switch can occur at any time within the exposure of a frame, and the measured switches
     occurred at only a few such times.
 

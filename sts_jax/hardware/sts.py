@@ -1,4 +1,4 @@
-"""`STS`: camera and lights as one sensor. It returns only images during whose exposure the lights did not change."""
+"""`STS`: camera and lights as one sensor. The lights do not change during the exposure of an image that it returns."""
 
 import dataclasses
 import itertools

@@ -38,9 +38,9 @@ class Terms(NamedTuple):
     In the loss, the divergence is multiplied by `beta`, and each error by `Modality.weight`. The fields `kl` and
     `reconstruction` do not contain these factors.
 
-    Both fields are means over combinations (sample, subset of the modalities). The means exclude the combinations that
-    the loss ignores. For example, a combination is ignored if the sample has inputs, but none from the modalities of
-    the subset.
+    Both fields are means over combinations of a sample and a subset of the modalities. The means exclude the
+    combinations that the loss ignores. For example, the loss ignores a combination if the sample has inputs, but all
+    of them belong to modalities outside the subset.
     """
 
     loss: Float[Array, ""]  # the weighted sum that is minimised, averaged over the batch

@@ -114,8 +114,8 @@ def load(
             that is not closed or encloses no volume then bounds the contents. Missing materials and images are left
             out.
         up: Axis of the file, or direction in the file, that becomes +z. The convention of glTF files is "y".
-        front: Direction in the file that becomes -y. If `up` is a tuple, None is (0, -1, 0). If `up` is an axis,
-            `front` must be None.
+        front: Direction in the file that becomes -y. If `up` is an axis such as "z", `front` must be None. If
+            `up` is a direction (a tuple), the default None means (0, -1, 0).
         texture: Image file that replaces the file's own textures. It needs texture coordinates in the mesh.
         textures: Additional folder in which the file's images are looked up.
         faces: Largest number of faces and of vertices, at least 4. A larger mesh is decimated with a warning, and its

@@ -91,7 +91,8 @@ def rasterise(
     """Find the nearest face at every pixel centre.
 
     Args:
-        points: Columns and rows of the vertices on the screen (pixels). They are whole numbers at pixel centres.
+        points: Columns and rows of the vertices on the screen (pixels). The centre of each pixel has whole-number
+            coordinates.
         order: Number for each vertex, smaller for nearer vertices. It must be a linear function of column and row on
             each face, such as -1 / depth for a pinhole, or depth for a parallel projection.
         faces: Vertex indices of each face, counter-clockwise as seen from outside the object in a right-handed frame.

@@ -109,10 +109,11 @@ def check_start(start: Start, scenario: Scenario, count: int) -> Start:
                 f"start.{name} has shape {values.shape}, but it must be one number or have the shape {(count,)}"
             )
     if held.dtype.kind not in "iu" or held.min() < 0:
-        raise ValueError(f"start.held is {start.held}, but it must be whole numbers of time steps >= 0")
+        raise ValueError(f"start.held is {start.held}, but each value must be an integer >= 0 (time steps)")
     if not (carried.min() >= 0 and carried.max() <= 1):
         raise ValueError(
-            f"start.carried has values from {carried.min()} to {carried.max()}, but each must be from 0 to 1"
+            f"start.carried has the smallest value {carried.min()} and the largest value {carried.max()}, but each "
+            "value must be from 0 to 1"
         )
     return Start(
         jnp.asarray(pose),
@@ -146,7 +147,10 @@ def check_hidden(hidden: Hidden, count: int) -> Hidden:
             raise ValueError(f"hidden.{name} has values that are not finite, but all must be finite")
     fill = arrays["fill"]
     if fill.min() < 0 or fill.max() > 1:
-        raise ValueError(f"hidden.fill has values from {fill.min()} to {fill.max()}, but each must be from 0 to 1")
+        raise ValueError(
+            f"hidden.fill has the smallest value {fill.min()} and the largest value {fill.max()}, but each value must "
+            "be from 0 to 1"
+        )
     for name in ("shell_scale", "friction"):
         if arrays[name].min() <= 0:
             raise ValueError(f"hidden.{name} has the value {arrays[name].min()}, but it must be > 0")

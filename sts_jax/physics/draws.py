@@ -1,4 +1,4 @@
-"""Draws of random starts and hidden properties, for the functions `simulate` and `starts`."""
+"""Draw the random starts of trajectories, and the hidden properties of the objects, such as friction and contents."""
 
 import functools
 from collections.abc import Sequence

@@ -103,14 +103,15 @@ class Released(Scenario):
 
         See `Scenario.start` for the arguments.
 
-        The object stands on a stable face and is tilted about an edge of this face. The edge is chosen from random
-        edges (the field `tries` is their number). Edges at which the object balances at a tilt of 15 to 45 degrees are
-        preferred. If no random edge is of this kind, for example for a cylinder on its side, any of the random edges is
-        used.
+        The object stands on a stable face and is tilted about an edge of this face. To choose the face and the edge,
+        the method draws `tries` random edges of stable faces. An edge is suitable if the object balances on it at a
+        tilt of 15 to 45 degrees. The method takes the suitable edge at which the balancing object has the lowest centre
+        of mass. If no drawn edge is suitable, for example for a cylinder on its side, the method takes the edge with
+        the lowest centre of mass.
 
-        If the edge is a preferred one, the object stands on the narrower of the two faces that meet at the edge. In
-        most cases, the object then turns by less than 45 degrees if it returns to the narrower face, and by more than
-        45 degrees if it topples onto the wider face. The method `outcome` uses this difference.
+        If the edge is suitable, the object stands on the narrower of the two faces that meet at the edge. In most
+        cases, the object then turns by less than 45 degrees if it returns to the narrower face, and by more than 45
+        degrees if it topples onto the wider face. The method `outcome` uses this difference.
         """
         candidates, beyond, skew, radius, angle, share = jax.random.split(key, 6)
         keys = jax.random.split(candidates, self.tries)

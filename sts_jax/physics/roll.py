@@ -1,4 +1,4 @@
-"""Simulation of one trajectory in MJX as a pure function: the step, its measurements, and one record per frame."""
+"""Simulation of one trajectory in MJX by pure functions, with one record of the object's state per frame."""
 
 from typing import NamedTuple
 
@@ -202,14 +202,16 @@ def roll(
     state: State,
     gravity: Float[Array, "frames steps 3"],
 ) -> tuple[State, Record]:
-    """Simulate one trajectory. Each frame is recorded after its interval, which is a fixed number of time steps.
+    """Simulate one trajectory, which consists of intervals of equal length.
+
+    An interval is a fixed number of time steps. One frame is recorded at the end of each interval.
 
     Args:
         model: Model of the scene in MJX.
         data: Data of the scene in MJX.
         hull: Collision hull of the object.
-        state: State at the beginning of the first frame's interval.
-        gravity: Gravity in each time step of each frame's interval, (frames, steps, 3) (m/s^2, sensor frame).
+        state: State at the beginning of the first interval.
+        gravity: Gravity in each time step of each interval, (frames, steps, 3) (m/s^2, sensor frame).
 
     Returns:
         The last state, and one record per frame.

@@ -1,10 +1,11 @@
 """Evaluation of an image function on those tiles of an image that have active pixels.
 
-Most of a sensor's image is empty. `where_active` cuts the image into square tiles and evaluates the tiles with an
-active pixel, batch by batch. The cost depends on the active area and not on the size of the image. In three cases, the
-function is instead called once with the whole image: if more than 40 % of the tiles are active (`CROWDED`), if the
-image is smaller than a tile, or if `where_active` runs under `vmap`. The gradient is always computed on the whole
-image.
+An active pixel is a pixel at which the function must be evaluated, such as a pixel that shows the object. In most
+images of a sensor, few pixels are active. `where_active` cuts the image into square tiles and evaluates the tiles with
+an active pixel, batch by batch. The cost depends on the number of these tiles and not on the size of the image. In
+three cases, the function is instead called once with the whole image: if more than 40 % of the tiles have an active
+pixel (`CROWDED`), if the image is smaller than a tile, or if `where_active` runs under `vmap`. The gradient is always
+computed on the whole image.
 """
 
 import functools

@@ -47,17 +47,17 @@ class Calibration(NamedTuple):
 
 
 def of_items(config: Config, calibration: Calibration, present: dict[str, Bool[Array, "n"]]) -> Calibration:
-    """Select the numbers of a calibration for each item, according to the inputs that the item has.
+    """Select the calibration of each item: the values for the subset of the inputs that the item has.
 
     Args:
         config: Configuration of the model.
-        calibration: Numbers for each subset of the inputs.
+        calibration: Values for each subset of the inputs.
         present: Masks `(n,)` of the inputs by name. True means that the item has the input. An item with the input
             `state` (the true pose, shape and mass) gets 1 for `outcome`, `weight` and `variance`, which leaves the
             predicted density of its final pose unchanged.
 
     Returns:
-        Numbers for each item, four arrays `(n,)`.
+        A `Calibration` whose four arrays, such as `outcome` and `contrast`, have one value for each item, `(n,)`.
     """
     names = enumerate(config.inputs)
     subset = jnp.asarray(sum(2**i * present[name].astype(int) for i, name in names if name in present))

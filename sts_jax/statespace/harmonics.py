@@ -64,7 +64,7 @@ def values(
         directions: Unit vectors.
 
     Returns:
-        Values of the rotated functions at the j directions.
+        Values of the rotated functions at the given directions.
     """
     degree = math.isqrt(coefficients.shape[-1]) - 1
     return jnp.einsum("nck,njk->ncj", coefficients, basis(jnp.asarray(directions) @ rotation, degree))

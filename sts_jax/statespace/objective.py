@@ -3,13 +3,14 @@
 A batch has the first and the last frames of some trajectories. The inputs are from the first frame. The targets
 are the true state in the first frame, and the images, the pose and the outcome of the last frame. The state code is a
 vector that describes the pose, the shape and the mass of the object. The appearance code describes all other visible
-properties. The loss is the weighted sum of these terms. NLL is a negative log likelihood.
+properties. `fuse` combines the estimates of both codes from some of the inputs into one Gaussian, which is called the
+belief from these inputs. The loss is the weighted sum of these terms. NLL is a negative log likelihood.
 
 - `state` and `doubt`: the squared error of the state code that each encoder estimates, and the NLL by which the encoder
   learns the variance of this error
 - `outcome` and `pose`: the NLL of the true outcome, and the NLL of the true final pose and of the rotation from the
-  first to the final pose. The transition network predicts all three from a belief, which is the Gaussian that `fuse`
-  computes. Each NLL is a mean over the beliefs from all non-empty subsets of the inputs
+  first to the final pose. The transition network predicts all three from the state code of a belief. Each NLL is a
+  mean over the beliefs from all non-empty subsets of the inputs
 - `visual` and `tactile`: the cross-entropy of the rendered images of the last frame, minus the entropy of the targets.
   `visual` is a sum over the pixels that show the object. `tactile` is a sum over all pixels
 - `first`: the sum of the terms `visual` and `tactile`, but computed for the input images of the first frame
@@ -17,8 +18,8 @@ properties. The loss is the weighted sum of these terms. NLL is a negative log l
 - `look`: the divergence of the appearance code from its prior, multiplied by `beta` in the loss
 
 The decoder renders the object in its true pose in each of the two frames. It therefore never learns a mean of images
-for several possible poses. The appearance code of each item of the batch is drawn from a belief. This belief is from a
-random subset of the item's inputs that contains an image.
+for several possible poses. For each item of the batch, a random subset of its inputs is chosen that contains an image.
+The decoder receives an appearance code that is drawn from the belief from this subset.
 
 Two further kinds of data contribute to some of the terms. *Views* are first frames without a trajectory. Views
 contribute to `state` and `doubt`. In `first` and `covered`, views replace the first frames of the trajectories. *Falls*

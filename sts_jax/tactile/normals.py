@@ -17,12 +17,12 @@ def surface_normals(
     paper, supplement "Simulator Details").
 
     Args:
-        points: x, y and z of the points in the sensor frame (m). The grid of points extends beyond the result by one
-            row or column on each side (a = h + 2, b = w + 2). The axes *n are batch axes
-            of separate grids.
+        points: x, y and z of the points in the sensor frame (m), three arrays of shape (a, b, *n). The grid has a rows
+            and b columns. The axes *n are batch axes of separate grids.
 
     Returns:
-        Unit normals towards the camera (z <= 0).
+        Unit normals towards the camera (z <= 0), of shape (h, w, *n, 3). The outermost rows and columns of the grid
+        have no normals, so h = a - 2 and w = b - 2.
     """
     height, width = (n - 2 for n in points[0].shape[:2])
     # Differences from the middle point, in millimetres, preserve the precision of float32.

@@ -2,7 +2,7 @@
 
 A calibration has the numbers that correct the predicted density of the final pose, see `statespace.Calibration`. The
 file also has a checksum of its own content, and a checksum of the model's other files at the time of the fit. The file
-is written as a whole after the training, so that an interruption leaves the model unchanged.
+is written atomically. If the process is interrupted during the write, the previous file (if any) stays unchanged.
 """
 
 from pathlib import Path

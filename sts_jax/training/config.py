@@ -44,7 +44,8 @@ class TrainConfig:
     clip: float | None = field(default=None, metadata=POSITIVE)
     # share of the steps over which beta rises from 0 to 1 (paper: 50 of 200 epochs)
     beta_warmup: float = field(default=0.25, metadata=SHARE)
-    seed: int = 0  # seed of the initial parameters, of the order of the samples and of the noise
+    # seed of the initial parameters, of the order of the samples and of the noise
+    seed: int = field(default=0, metadata=_NUMBER)
     log_every: int = field(default=10, metadata=COUNT)  # number of steps whose mean is one record of the training log
     # number of steps between two checkpoints, a multiple of log_every
     checkpoint_every: int = field(default=200, metadata=COUNT)

@@ -173,8 +173,8 @@ def _check_paper(model: mvae.Config, arrays: Arrays, absent: tuple[str, ...]) ->
             )
         if np.any(arrays.present.get(name, False)):
             raise ValueError(
-                f"`absent` contains {name!r}, but `present[{name!r}]` marks {int(np.sum(arrays.present[name]))} "
-                "samples that have this modality: remove the name from `absent`"
+                f"`absent` contains {name!r}, but some samples have this modality: remove the name from `absent`. The "
+                f"number of True values in `present[{name!r}]` is {int(np.sum(arrays.present[name]))}"
             )
     for kind, values in (("inputs", arrays.inputs), ("targets", arrays.targets)):
         needed = set(model.names) - (set(absent) if kind == "inputs" else set())

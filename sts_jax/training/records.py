@@ -87,5 +87,6 @@ def append(path: Path, record: Record) -> None:
             file.write(json.dumps(record) + "\n")
     except OSError as error:
         raise OSError(
-            f"cannot write {path}: {error}. {storage.remedy(error)}, then start again (the last checkpoint is kept)."
+            f"cannot write {path}: {error.strerror or error}. {storage.remedy(error)}, then start again (the last "
+            "checkpoint is kept)."
         ) from error

@@ -39,9 +39,9 @@ def frame_arrays(
 
     Returns:
         The arrays, and the preprocessing with new values of `absent` and `scales`. `absent` lists the modalities that
-        no sample has as an input, and `arrays.inputs` omits them. `absent` contains `tactile` if no first frame shows a
-        contact, and each further modality that was not measured in any first frame. `scales` contains the scale of each
-        further modality that is a vector.
+        no sample has as an input, and `arrays.inputs` omits them. If no first frame shows a contact, `tactile` is in
+        `absent`. A further modality is in `absent` if it was measured in no first frame. `scales` contains the scale of
+        each further modality that is a vector.
 
     Raises:
         ValueError: `pairs.measurements` lacks a further modality.

@@ -349,8 +349,9 @@ class Twin:
         """
         if self._clock is not None:
             raise RuntimeError(
-                "`step`, `capture`, `set` and `ping` need a twin on its virtual clock, but this twin runs on the "
-                "real clock: read its images through hardware.STS, or make a new Twin"
+                "`step`, `capture`, `set` and `ping` need a Twin that runs on its virtual clock, but this Twin runs on "
+                "the real clock: read its images through hardware.STS, or make a new Twin, because a new Twin runs on "
+                "a virtual clock"
             )
         if not 0 <= seconds < math.inf:
             raise ValueError(f"seconds must be >= 0 and finite, got {seconds}")

@@ -50,7 +50,7 @@ class Fault:
 
 
 class Queue:
-    """Queue of simulated faults of the twin that have not been applied yet. The queue is not thread-safe."""
+    """Queue of the faults that a twin (a simulated sensor) has not simulated yet. The queue is not thread-safe."""
 
     def __init__(self) -> None:
         self._waiting: list[Fault] = []

@@ -19,8 +19,9 @@ class Hand(AutomaticPerson):
     pose of the next trajectory. The trajectory without contact is not recorded, and its number stays unused in the
     session.
 
-    The session and the twin's scene each number the trajectories. The numbers agree if the first number of the scene is
-    the number of the session's next trajectory: `ObjectScene(first=hardware.next_recording(folder))`.
+    The session gives each trajectory a number, and the scene of the twin gives it a second number. The two
+    numbers are equal if the first number of the scene is the number of the session's next trajectory:
+    `ObjectScene(first=hardware.next_recording(folder))`.
     """
 
     def __init__(self, twin: Twin, session: Session, *, patience_s: float = 60.0):
@@ -46,10 +47,10 @@ class Hand(AutomaticPerson):
         self._unseen = 0  # held poses in a row without a visible contact
 
     def show(self, view: View) -> None:
-        """Receive a view from `hardware.collect`, and send the twin the command that fits the view's instruction.
+        """Move the object on the `Twin` (a simulated sensor) as the newest instruction of `hardware.collect` requires.
 
         Args:
-            view: Newest images and instruction.
+            view: Newest images and instruction. `hardware.collect` calls this method with each new view.
 
         Raises:
             ValueError: The instruction stays the same for longer than the argument `patience_s` of `Hand`, or no
@@ -74,10 +75,10 @@ class Hand(AutomaticPerson):
         if self._now_s - self._since_s > self._patience_s or self._unseen == _UNSEEN:
             raise ValueError(
                 f"hardware.collect has shown the instruction `{view.instruction}` for "
-                f"{self._now_s - self._since_s:.1f} s (contact: {view.contact}, still: {view.still}). The hand has "
-                f"tried {self._unseen} poses in a row in which no contact was found. The thresholds of "
-                f"hardware.collect do not suit the twin's images, or patience_s of Hand ({self._patience_s:g} s) is "
-                "too short. Change the argument config (a GuideConfig) of hardware.collect, or increase patience_s"
+                f"{self._now_s - self._since_s:.1f} s (contact: {view.contact}, still: {view.still}, poses in a "
+                f"row without contact: {self._unseen}). The thresholds of hardware.collect do not suit the images of "
+                f"the simulated sensor, or patience_s of Hand ({self._patience_s:g} s) is too short. Change "
+                "the argument config (a GuideConfig) of hardware.collect, or increase patience_s"
             )
 
     def action(self) -> Action | None:

@@ -141,7 +141,7 @@ class Picture(Scene):
     def ends(self, seen: Seen, blender: Blender) -> Ends:
         """Return the two images that were passed to `Picture`, in linear light and distorted by the lens.
 
-        See `Scene.ends` for the arguments. The images do not depend on `seen`.
+        See `Scene.ends` for the arguments. The argument `seen`, the state of the scene, has no effect on the images.
         """
         del seen
         if self._ends is None or self._ends[0] is not blender:
