@@ -27,16 +27,9 @@ import tyro
 from tqdm import tqdm
 
 import sts_jax as sts
-from experiments import freefall, inclined, perturbed, released
+from benchmarks.instruments.experiments import EXPERIMENTS
 from experiments.shared import rerolls, stages
 from sts_jax import dataset, evaluation, storage
-
-CONFIGS = {
-    "freefall": freefall.DEFAULT,
-    "perturbed": perturbed.DEFAULT,
-    "inclined": inclined.DEFAULT,
-    "released": released.DEFAULT,
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,7 +81,7 @@ def spread(start: np.ndarray, end: np.ndarray, outcome: np.ndarray) -> list[str]
 
 def main(args: Args) -> None:
     """Collect missing parts of the experiment's dataset, and print the errors of the best possible predictions."""
-    config, sensor = CONFIGS[args.scenario], sts.Sensor()
+    config, sensor = EXPERIMENTS[args.scenario].DEFAULT, sts.Sensor()
     if args.workdir is None:  # save time: symmetric copies and whole films do not change the held-out list
         collection = dataclasses.replace(config.collection, symmetries=False, num_full=0)
         config = dataclasses.replace(config, collection=collection)

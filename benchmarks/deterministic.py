@@ -27,11 +27,10 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 import sts_jax as sts
-from experiments import freefall, inclined, perturbed
+from benchmarks.instruments.experiments import EXPERIMENTS
 from experiments.shared import command, stages
 from sts_jax import dataset, evaluation, statespace, storage, training
 
-EXPERIMENTS = {"freefall": freefall, "inclined": inclined, "perturbed": perturbed}
 BATCH, RATE, WARMUP = 32, 1e-3, 100
 POSE_WEIGHT, TACTILE_WEIGHT, OUTCOME_WEIGHT = 300.0, 4.0, 8.0  # the visual image's cross-entropy (nat) has weight 1
 TITLE = "deterministic network, from all inputs"

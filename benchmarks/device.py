@@ -34,7 +34,7 @@ import tyro
 
 from benchmarks.instruments import sensor_peer, twin_peer
 from benchmarks.instruments.shown import Shown
-from sts_jax import hardware
+from sts_jax import hardware, storage
 
 SIZE = (640, 480)
 FPS = 60.0
@@ -200,8 +200,7 @@ def main(args: Args) -> str:
         report(found) + f"\n{os.cpu_count()} CPU cores, with a load of {load:.1f} processes over the last 5 minutes\n"
     )
     if args.out is not None:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        args.out.write_text(text)
+        storage.write_bytes(args.out, text.encode())
     return text
 
 

@@ -37,7 +37,7 @@ import tyro
 from serial.tools import list_ports_common
 
 from benchmarks.instruments.sensor_peer import SensorPeer
-from sts_jax import hardware
+from sts_jax import hardware, storage
 
 FPS = 60.0
 TIMEOUT_S = 2.0  # limit for one image
@@ -491,8 +491,7 @@ def main(args: Args) -> str:
         f"CPU cores with a load of {load:.1f} processes on average over the last 15 minutes\n"
     )
     if args.out is not None:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        args.out.write_text(text)
+        storage.write_bytes(args.out, text.encode())
     return text
 
 

@@ -40,8 +40,7 @@ import numpy as np
 import tyro
 from jaxtyping import PRNGKeyArray
 
-from benchmarks import soak
-from benchmarks.instruments import classifier, cnn, jerk_features, slope_features
+from benchmarks.instruments import blocks, classifier, cnn, jerk_features, slope_features
 from benchmarks.instruments.starts import Starts, bodies, draw, kept, roll
 from sts_jax import objects, physics, storage
 from sts_jax.evaluation import metrics
@@ -306,7 +305,7 @@ def begun(study: Study, args: Args) -> tuple[list[objects.Body], Starts]:
     the folder `args.keep` already contains them.
     """
     if args.soaked is not None:
-        starts = soak.soaked(args.soaked, args.scenario)
+        starts = blocks.soaked(args.soaked, args.scenario)
         return bodies(study.categories, int(starts.body.max()) + 1), starts
     count = 200 if args.objects is None else args.objects
     again = 8 if args.again is None else args.again

@@ -18,7 +18,7 @@ import numpy as np
 import tyro
 
 import sts_jax as sts
-from experiments import twin
+from experiments.shared import twin_device
 from experiments.shared.live import Backgrounds, Views
 from sts_jax import hardware
 
@@ -47,7 +47,7 @@ def collect(args: Args) -> tuple[Pair, list[Pair], list[Pair]]:
         rest. A pair is a visual and a tactile image. Each list has one pair per trajectory.
     """
     # The images during the motion are not read, so one pose per second of the motion is rendered.
-    with twin.make(twin.Config(motion_rate=1.0, seed=args.seed)) as device:
+    with twin_device.make(twin_device.Config(motion_rate=1.0, seed=args.seed)) as device:
 
         def pair() -> Pair:
             images = []

@@ -47,7 +47,8 @@ import tyro
 from benchmarks.instruments import fresh
 from benchmarks.instruments.starts import bodies, rigid_of
 from benchmarks.instruments.timing import in_turn
-from sts_jax import dataset, objects, physics
+from experiments.shared import output
+from sts_jax import dataset, objects, physics, storage
 from sts_jax.dataset.rendering import RENDER_BATCH
 from sts_jax.physics import bodies as physics_bodies
 from sts_jax.physics import contact, scene
@@ -284,11 +285,10 @@ def write_scaling(rows: Sequence[Speeds], device: str, chunk: int) -> None:
     from matplotlib.figure import Figure
 
     names = ("MJX, all at once", f"MJX, {chunk} at a time, {WORKERS} threads", f"C MuJoCo, {os.cpu_count()} threads")
-    RESULTS.mkdir(parents=True, exist_ok=True)
     lines = [f"| worlds | {' | '.join(names)} |", "|---|---|---|---|"]
     lines += [f"| {' | '.join(f'{number:,.0f}' for number in row)} |" for row in rows]
     title = f"Steps per second, one hull of 32 vertices ({device}, {os.cpu_count()} cores)"
-    (RESULTS / "scaling.md").write_text("\n".join([title, "", *lines, ""]))
+    storage.write_bytes(RESULTS / "scaling.md", "\n".join([title, "", *lines, ""]).encode())
     figure = Figure(figsize=(5, 3.6), layout="constrained")
     axes = figure.subplots()
     worlds, *speeds = zip(*rows, strict=True)
@@ -298,7 +298,7 @@ def write_scaling(rows: Sequence[Speeds], device: str, chunk: int) -> None:
     axes.title.set_fontsize(9)
     axes.grid(alpha=0.3, which="both")
     axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(0.02, 0.52))
-    figure.savefig(RESULTS / "scaling.png", dpi=150)
+    output.write_figure(RESULTS / "scaling.png", figure, dpi=150)
 
 
 def draw(body: objects.Body, traj: physics.Trajectory) -> None:

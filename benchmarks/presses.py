@@ -40,7 +40,8 @@ from jaxtyping import Array, Float
 from PIL import Image
 from scipy.optimize import nnls
 
-from sts_jax import tactile
+from experiments.shared import output
+from sts_jax import storage, tactile
 
 PITCH = 0.0295e-3  # m per pixel (taxim/calib/gelsight/params.json)
 RADIUS = 2e-3  # m, radius of the ball
@@ -305,7 +306,6 @@ def panel(presses: Presses, index: int, constants: tactile.Phong, leds: tactile.
 
 def main() -> None:
     """Fit the lights, print the peak signal-to-noise ratios, and write `presses.png` and `presses.txt`."""
-    OUT.mkdir(parents=True, exist_ok=True)
     lines: list[str] = []
 
     def say(line: str) -> None:
@@ -329,8 +329,8 @@ def main() -> None:
     say(f"near: {np.sum((x < across) & (y < down))} under the picture, {z.min():.1f} to {z.max():.0f} mm below the gel")
     say(f"fall-off {lights.falloff:.2f}, specular {constants.specular:.3f}, shininess {constants.shininess:.2f}")
     strip = np.concatenate([panel(presses, int(index), constants, lights) for index in np.flatnonzero(held)], axis=1)
-    Image.fromarray(np.round(255 * strip).astype(np.uint8)).save(OUT / "presses.png")
-    (OUT / "presses.txt").write_text("\n".join(lines) + "\n")
+    output.write_picture(OUT / "presses.png", Image.fromarray(np.round(255 * strip).astype(np.uint8)))
+    storage.write_bytes(OUT / "presses.txt", ("\n".join(lines) + "\n").encode())
 
 
 if __name__ == "__main__":

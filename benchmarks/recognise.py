@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 
 import sts_jax as sts
-from experiments.shared import command
+from experiments.shared import command, output
 from sts_jax import dataset
 
 NUMBER = 10
@@ -69,7 +69,7 @@ def main(args: Args) -> str:
         axis.imshow(image, interpolation="nearest")
         axis.set_title(title)
         axis.axis("off")
-    figure.savefig(args.out, dpi=80)
+    output.write_figure(args.out, figure, dpi=80)
     answers = " ".join(f"{letter}{int(np.flatnonzero(order == k)[0]) + 1}" for k, letter in enumerate(letters))
     return f"{args.out}: from {' and '.join(given)}, held-out {rows[0]} to {rows[-1]}\nanswers: {answers}"
 

@@ -22,7 +22,7 @@ import numpy as np
 import tyro
 
 import sts_jax as sts
-from benchmarks.deterministic import EXPERIMENTS
+from benchmarks.instruments.experiments import EXPERIMENTS
 from experiments.shared import command, stages
 from experiments.shared.config import Config
 from experiments.shared.progress import say

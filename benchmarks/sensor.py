@@ -51,6 +51,7 @@ import sts_jax as sts
 from benchmarks.instruments import fresh
 from benchmarks.instruments.meshes import public_meshes
 from benchmarks.instruments.timing import in_turn
+from experiments.shared import output
 from sts_jax import geometry, objects, optics, tactile
 from sts_jax.rendering import drawing, equilibrium
 
@@ -430,8 +431,7 @@ def cost() -> None:
         )
     right.set(xlabel="faces", ylabel="ms a frame", title="a bottle at rest")
     right.legend()
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    figure.savefig(RESULTS / "cost.png", dpi=110)
+    output.write_figure(RESULTS / "cost.png", figure, dpi=110)
 
 
 def compilations(number: int = 100) -> None:

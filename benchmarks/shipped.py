@@ -24,12 +24,11 @@ import numpy as np
 import tyro
 
 import sts_jax as sts
-from experiments import freefall, inclined, perturbed, released
+from benchmarks.instruments.experiments import EXPERIMENTS
 from experiments.shared.judging import MAIN_SUBSETS
 from experiments.shared.progress import Bar
 from sts_jax import dataset, evaluation, physics, statespace
 
-EXPERIMENTS = {"freefall": freefall, "inclined": inclined, "perturbed": perturbed, "released": released}
 PER_OBJECT = 4  # trajectories of each object
 REFERENCE = 0.2  # share of the objects that define the constant baseline and the frequencies of the outcomes
 METRICS = {metric.name: metric for metric in evaluation.METRICS}

@@ -19,7 +19,6 @@ analyses the blocks that `--keep FOLDER` has kept.
 """
 
 import dataclasses
-import json
 import tempfile
 from pathlib import Path
 from typing import Literal
@@ -30,19 +29,13 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from benchmarks.instruments.starts import Starts, bodies, rigid_of
+from benchmarks.instruments.blocks import NUM, SCENARIOS, claim
+from benchmarks.instruments.starts import bodies, rigid_of
 from sts_jax import geometry, objects, physics, storage
 from sts_jax.physics.scenario import G
 from sts_jax.physics.simulation import SUNK_LIMIT
 from sts_jax.sensor import Sensor
 
-SCENARIOS: dict[str, physics.Scenario] = {
-    "freefall": physics.Freefall(),
-    "inclined": physics.Inclined(),
-    "perturbed": physics.Perturbed(),
-    "released": physics.Released(),
-}
-NUM = 8  # trajectories of each object
 BLOCK = 504  # trajectories simulated by one call, unless fewer are requested
 
 
@@ -136,46 +129,6 @@ def block(name: str, index: int, size: int) -> dict[str, np.ndarray]:
         "wrench_error": np.where(at_rest, error, np.nan),
         "excess": np.where(out_of_contact, free, -np.inf).max(1) if constant else np.full(len(fell), np.nan),
     }
-
-
-def claim(folder: Path, name: str, size: int) -> None:
-    """Write a JSON file with the simulation settings of a scenario, such as the number of trajectories per object.
-
-    Raises:
-        ValueError: The folder already has such a file with other settings. The message names all settings that differ.
-    """
-    settings = {"scenario": repr(SCENARIOS[name]), "num": NUM, "block": size, "sunk_limit": SUNK_LIMIT}
-    storage.claim(folder / f"{name}.json", settings)
-
-
-def soaked(folder: Path, name: str) -> Starts:
-    """Load the initial states and outcomes of a scenario's trajectories, which a run with `--keep` stored.
-
-    Args:
-        folder: Folder of a run with `--keep`.
-        name: Name of the scenario, in SCENARIOS.
-
-    Returns:
-        The initial states and outcomes, with one row for each trajectory. All values of the field `rerolled` are -1.
-        This field is for benchmarks that simulate each initial state a second time.
-
-    Raises:
-        FileNotFoundError: The folder has no stored trajectories of the scenario.
-        ValueError: The trajectories were made with other settings. The message names all settings that differ.
-    """
-    claimed, paths = folder / f"{name}.json", sorted(folder.glob(f"{name}-????.npz"))
-    if not (claimed.exists() and paths):
-        raise FileNotFoundError(
-            f"{folder} has no stored trajectories ({name}.json and {name}-*.npz): make them with "
-            f"python -m benchmarks.soak --keep {folder}"
-        )
-    claim(folder, name, json.loads(claimed.read_text())["block"])
-    parts = []
-    for path in paths:
-        with np.load(path) as kept:
-            known = {field: kept[field] for field in Starts._fields if field != "rerolled"}
-            parts.append(Starts(**known, rerolled=np.full(len(kept["body"]), -1)))
-    return Starts(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def report(name: str, found: dict[str, np.ndarray]) -> str:

@@ -28,7 +28,7 @@ import tyro
 from matplotlib.figure import Figure
 
 import sts_jax as sts
-from experiments import sense
+from experiments.shared import laying, output
 from experiments.shared.errors import on_one_line
 from sts_jax import tactile
 
@@ -46,7 +46,7 @@ FAINT = 0.25
 
 
 @dataclasses.dataclass(frozen=True)
-class Config(sense.Config):
+class Config(laying.Config):
     """Options of the command line: the object, its true pose, and the number of fits."""
 
     mesh: Annotated[str, tyro.conf.Positional]  # path of a mesh file, or name of an object class
@@ -56,7 +56,7 @@ class Config(sense.Config):
     turn: float = 23.7  # true turn of the object about the vertical axis (degrees)
     starts: int = 10  # number of fits, each from another initial pose
 
-    # These options of experiments.sense have no meaning here.
+    # A fit does not use these options of `laying.Config`.
     crop: Annotated[bool, tyro.conf.Suppress] = False
     light: Annotated[float, tyro.conf.Suppress] = 1.0
     height: Annotated[float, tyro.conf.Suppress] = 0.0
@@ -233,7 +233,7 @@ def draw(config: Config, target: np.ndarray, paths: list[list[tuple[np.ndarray, 
     axes[5].set(
         title=f"the paths of {len(paths)} starts", xlabel="x off by (mm)", ylabel="y off by (mm)", aspect="equal"
     )
-    figure.savefig(config.out, dpi=100)
+    output.write_figure(config.out, figure, dpi=100)
 
 
 def main(config: Config) -> None:
@@ -242,14 +242,14 @@ def main(config: Config) -> None:
     Raises:
         ValueError: An option is out of range, or the object leaves no imprint.
     """
-    sense.check(config)
+    laying.check(config)
     if config.starts < 1:
         raise ValueError(f"--starts is {config.starts}, but it must be at least 1")
     if config.force == 0:
         raise ValueError("--force is 0, but it must be > 0 (N), so that the object leaves an imprint")
     sensor = sts.Sensor() if config.sensor is None else sts.Sensor.load(config.sensor)
-    body = sense.read(config, config.mesh)
-    pose, wrench, words = sense.lay(config, sensor, body)
+    body = laying.read(config, config.mesh)
+    pose, wrench, words = laying.lay(config, sensor, body)
     given = jnp.asarray(pose, jnp.float32), jnp.asarray(wrench, jnp.float32)
     target = touch(sensor, body, *given, resolution=config.resolution)
     empty = touch(sensor, body, given[0].at[2].set(-1), given[1], resolution=config.resolution)

@@ -24,7 +24,7 @@ from matplotlib import pyplot
 
 import sts_jax as sts
 from experiments.shared import errors, output
-from sts_jax import optics
+from sts_jax import optics, storage
 
 DISTANCE = 0.42  # distance from the camera to the object (m)
 FIELD = 0.36  # field of view (rad). At this distance, 150 mm fill the picture
@@ -120,7 +120,7 @@ def main(config: Config) -> None:
         order = np.asarray(jax.random.permutation(key, len(drawn)))
         drawn = [drawn[i] for i in order]
         lines = [f"{i + 1} {category}" for i, (category, _) in enumerate(drawn)]
-        config.out.with_suffix(".txt").write_text("\n".join(lines) + "\n")
+        storage.write_bytes(config.out.with_suffix(".txt"), ("\n".join(lines) + "\n").encode())
 
     print("class  number: size (mm); faces; collision hull; gaps (mm)")
     for index, (category, body) in enumerate(drawn):
@@ -135,7 +135,7 @@ def main(config: Config) -> None:
         axis.set_title(str(index + 1) if config.shuffle else category, fontsize=7, pad=1)
         axis.axis("off")
     figure.subplots_adjust(0.005, 0.005, 0.995, 0.985, 0.02, 0.08)
-    figure.savefig(config.out, dpi=100)
+    output.write_figure(config.out, figure, dpi=100)
     pyplot.close(figure)
 
 

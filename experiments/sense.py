@@ -10,12 +10,8 @@ first three images of each object. The command prints the size of the object, th
 it sinks into the gel.
 """
 
-import dataclasses
 import functools
-import math
 import time
-from pathlib import Path
-from typing import Annotated, Literal
 
 import jax
 import jax.numpy as jnp
@@ -23,150 +19,15 @@ import numpy as np
 import tyro
 from matplotlib import colormaps
 from PIL import Image, ImageDraw, ImageFont
-from scipy.spatial.transform import Rotation
 
 import sts_jax as sts
 from experiments.shared import errors, output
+from experiments.shared.laying import Config, check, lay, read
 from sts_jax import tactile
 
-G = 9.81  # gravity (m/s^2)
-FILL = 0.5  # share of a container's interior that is filled
 HEAD = 22  # height of the caption above a panel (pixels)
 SHEET = (234, 312)  # (height, width) of one image in the picture of all classes (pixels)
 NARROWEST = 160  # smallest width of a panel (pixels). Smaller images are magnified
-
-
-@dataclasses.dataclass(frozen=True)
-class Config:
-    """Options of the command line: the object, its pose, its mass, the force of the pad on it, and the picture."""
-
-    # path of a mesh file, name of an object class such as bottle, or `classes` for one object of each class
-    mesh: Annotated[str, tyro.conf.Positional]
-    out: Path = Path("sense.png")  # path of the picture
-    sensor: Path | None = None  # file with the sensor's constants, written by Sensor.save. None: the paper's sensor
-    resolution: tuple[int, int] = (480, 640)  # height and width of the images (pixels)
-    crop: bool = False  # show only a window around the object, in the image's aspect ratio
-    # brightness of the LEDs in the image between the visual and the tactile one, as a share of full power, 0 to 1
-    light: float = 0.5
-
-    rest: int = 0  # index of the face on which the object rests. 0 is the most likely one
-    position: tuple[float, float] = (0.0, 0.0)  # x and y of the centre of the object's bounding box (m)
-    height: float = 0.0  # height of the object's lowest point above the gel (m)
-    turn: float = 0.0  # turn of the object about the vertical (degrees)
-    tilt: tuple[float, float] = (0.0, 0.0)  # tilt of the object away from rest, about x and about y (degrees)
-
-    mass: float | None = None  # mass of the object (kg). None: that of a shell half full of water
-    # force of the pad on the object, upwards through its centre of mass (N). None: its weight, or 0 in the air
-    force: float | None = None
-
-    longest_side: float | None = None  # scale a mesh file so that its longest side has this length (m)
-    scale: float | None = None  # length of one unit of a mesh file (m), such as 0.001 for millimetres
-    up: Literal["x", "y", "z"] | None = None  # axis of a mesh file that points up. None: y for glTF, otherwise z
-    faces: int | None = None  # reduce a mesh file with more faces to this number
-    texture: Path | None = None  # image file to use as the texture of a mesh file
-    seed: int = 0  # seed that selects the object of a class
-
-
-def check(config: Config) -> None:
-    """Check the options before any work.
-
-    Raises:
-        ValueError: An option is out of range.
-        OSError: The picture cannot be written.
-    """
-    if min(config.resolution) < 1:
-        raise ValueError(f"--resolution is {config.resolution}, but height and width must be at least 1 pixel")
-    numbers = {
-        "position": config.position,
-        "height": (config.height,),
-        "turn": (config.turn,),
-        "tilt": config.tilt,
-        "force": (config.force or 0.0,),
-        "mass": (1.0 if config.mass is None else config.mass,),
-    }
-    for name, values in numbers.items():
-        if not all(math.isfinite(value) for value in values):
-            raise ValueError(f"--{name} is {getattr(config, name)}, but it must be finite")
-    for name, value in (("mass", config.mass), ("force", config.force)):
-        if value is not None and (value < 0 or (name == "mass" and value == 0)):
-            raise ValueError(f"--{name} is {value}, but it must be " + (">= 0 (N)" if name == "force" else "> 0 (kg)"))
-    output.check_picture(config.out)
-
-
-def read(config: Config, name: str) -> sts.objects.Body:
-    """Load the object from a mesh file, or generate an object of an object class such as `bottle`.
-
-    Args:
-        config: Options of the command line.
-        name: Path of a mesh file, or name of an object class.
-
-    Raises:
-        FileNotFoundError: The name is neither a file nor an object class.
-        ValueError: An option for mesh files is given for an object class, or `objects.load` refuses the file.
-    """
-    if name not in sts.objects.CATEGORIES:
-        path = Path(name)
-        if not path.exists() and not path.suffix:
-            classes = ", ".join(sts.objects.CATEGORIES)
-            raise FileNotFoundError(
-                f"{name} is neither a file nor an object class ({classes}): give the path of a mesh file, or a class"
-            )
-        return sts.objects.load(
-            path,
-            longest_side=config.longest_side,
-            scale=config.scale,
-            mass=config.mass,
-            up=config.up or ("y" if path.suffix.lower() in (".glb", ".gltf") else "z"),
-            texture=config.texture,
-            faces=config.faces,
-        )
-    for option in ("longest_side", "scale", "up", "faces", "texture"):
-        if getattr(config, option) is not None:
-            raise ValueError(
-                f"--{option.replace('_', '-')} is for mesh files, but {name} is an object class: leave out this option"
-            )
-    index = sts.objects.CATEGORIES.index(name)
-    body = sts.objects.make(jax.random.fold_in(jax.random.key(config.seed), index), name)
-    if config.mass is None:
-        return body
-    return dataclasses.replace(
-        body, shell_mass=jnp.float32(config.mass), contents_density=jnp.zeros_like(body.contents_density)
-    )
-
-
-def lay(config: Config, sensor: sts.Sensor, body: sts.objects.Body) -> tuple[np.ndarray, np.ndarray, str]:
-    """Place the object at rest (`physics.place`), then tilt, turn and move it as the options require.
-
-    Returns:
-        Three values. The first value is the pose of the object in the sensor frame, shape (7,). The second value is the
-        force and moment that the pad exerts on the object, shape (6,). The third value describes how the object rests.
-
-    Raises:
-        ValueError: The object has no face with the index `rest`.
-    """
-    shares = sts.physics.stable_faces(body, fill=FILL).share
-    if not 0 <= config.rest < len(shares):
-        raise ValueError(
-            f"--rest is {config.rest}, but it must be the index of a face on which the object can rest, from 0 to "
-            f"{len(shares) - 1}"
-        )
-    rest = sts.physics.place(body, sensor, face=config.rest, fill=FILL)
-    turn = Rotation.from_quat(np.asarray(rest.pose[3:], float), scalar_first=True)
-    turn = Rotation.from_rotvec([*config.tilt, 0], degrees=True) * turn
-    turn = Rotation.from_rotvec([0, 0, config.turn], degrees=True) * turn
-    turned = turn.apply(np.asarray(body.vertices, float))
-    low, high = turned.min(0), turned.max(0)
-    place = np.array([*config.position, config.height]) - np.array([*(low + high)[:2] / 2, low[2]])
-    pose = np.concatenate([place, turn.as_quat(canonical=True, scalar_first=True)])
-    carries = np.asarray(sts.physics.weight(body, pose.astype(np.float32), fill=FILL), float)
-    force = config.force if config.force is not None else carries[2] * (config.height <= 0)
-    wrench = force / carries[2] * carries
-    mass = float(carries[2]) / G
-    face = f"face {config.rest} of the {len(shares)} that it can rest on (share {shares[config.rest]:.2f})"
-    if any(config.tilt):
-        face += ", tilted by {:g} and {:g} degrees".format(*config.tilt)
-    where = f"{1e3 * config.height:.1f} mm over the gel" if config.height > 0 else f"pressed by {force:.3g} N"
-    return pose, wrench, f"{face}; {mass:.3g} kg, {where}"
 
 
 @functools.partial(jax.jit, static_argnames=("resolution", "crop", "light"))
@@ -276,7 +137,7 @@ def main(config: Config) -> None:
         print(f"{name}: {size} mm, {faces}\n{lines}", flush=True)
         pictures = panels(frame, between, config.light)
         if len(names) == 1:
-            compose(pictures, 3).save(config.out)
+            output.write_picture(config.out, compose(pictures, 3))
         else:
             small = SHEET[0] / config.resolution[0]
             for stream, values in pictures[:3]:
@@ -284,7 +145,7 @@ def main(config: Config) -> None:
                 image = image.resize((round(image.width * small), SHEET[0]), Image.Resampling.BOX)
                 sheet.append((f"{name}, {stream}", np.asarray(image) / 255))
     if sheet:
-        compose(sheet, 6).save(config.out)
+        output.write_picture(config.out, compose(sheet, 6))
     print(config.out)
 
 

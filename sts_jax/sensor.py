@@ -134,6 +134,10 @@ class Sensor:
             DamagedFileError: The file cannot be read or is not valid JSON. DamagedFileError is an OSError.
             ValueError: A field is missing, unknown, of another shape or out of range (see `check`).
         """
+        if not Path(path).exists():
+            raise FileNotFoundError(
+                f"{path} does not exist: give a file that Sensor.save wrote, or the sensor.json of a dataset"
+            )
         values = read_json(Path(path), "write it again with Sensor.save")
         if isinstance(values, dict):
             values.pop("device", None)

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+import sklearn.metrics
 from scipy import stats
 
 from sts_jax.evaluation import intervals, metrics
@@ -256,6 +257,9 @@ def test_the_area_under_the_curve_counts_pairs():
             total += weight[i] * weight[j]
             wins += weight[i] * weight[j] * ((score[i] > score[j]) + 0.5 * (score[i] == score[j]))
     assert metrics.auc(positive, score, weight) == pytest.approx(wins / total)
+    assert metrics.auc(positive, score, weight) == pytest.approx(
+        sklearn.metrics.roc_auc_score(positive, score, sample_weight=weight)
+    )
     statistic = stats.mannwhitneyu(score[positive], score[~positive]).statistic
     assert metrics.auc(positive, score) == pytest.approx(statistic / (positive.sum() * (~positive).sum()))
     assert math.isnan(metrics.auc(np.ones(4, bool), score[:4]))

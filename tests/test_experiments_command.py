@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import warnings
 from pathlib import Path
 
@@ -16,9 +17,15 @@ from sts_jax import compilation, dataset, physics, storage, training
 BOTTLES = ("bottle",)
 
 
+def smoke_of_few(experiment):
+    """The preset `smoke` of an experiment, with shares for which four objects are enough."""
+    collection = dataclasses.replace(experiment.SMOKE.collection, shares=(0.5, 0.25, 0.25))
+    return dataclasses.replace(experiment.SMOKE, collection=collection)
+
+
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Four bottles and three boxes. Four objects are enough."""
+    """Four bottles and three boxes."""
     for label, count in (("bottle", 4), ("box", 3)):
         (tmp_path / "meshes" / label).mkdir(parents=True)
         for i in range(count):
@@ -26,7 +33,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             mesh = trimesh.creation.box((side, 0.04, 0.05)) if label == "box" else trimesh.creation.cylinder(side, 0.06)
             mesh.export(tmp_path / "meshes" / label / f"{i}.stl")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(command, "LEAST_OBJECTS", 4)
     return tmp_path / "meshes"
 
 
@@ -175,7 +181,7 @@ def test_a_work_directory_of_another_configuration_names_the_fields_that_differ(
 def test_the_classes_of_the_experiment_or_the_requested_ones_are_taken_from_a_folder(
     experiment, asked, folder, tmp_path, capsys
 ):
-    args = command.Args(tmp_path / "run", experiment.SMOKE, objects=folder, classes=asked)
+    args = command.Args(tmp_path / "run", smoke_of_few(experiment), objects=folder, classes=asked)
     one = command.configure(args).collection
     assert one.meshes is not None
     assert one.meshes.labels == ("bottle",) * 4 + ("box",) * (3 if asked else 0)
@@ -195,7 +201,7 @@ def test_the_classes_of_the_experiment_or_the_requested_ones_are_taken_from_a_fo
 
 
 def test_all_classes_are_taken_from_a_folder_without_those_of_the_experiment(folder, tmp_path):
-    small = command.Args(tmp_path / "small", freefall.SMOKE, objects=folder, scale=0.5, up="y")
+    small = command.Args(tmp_path / "small", smoke_of_few(freefall), objects=folder, scale=0.5, up="y")
     meshes = command.configure(small).collection.meshes
     assert meshes is not None
     assert (meshes.scale, meshes.up) == (0.5, "y")
@@ -203,19 +209,67 @@ def test_all_classes_are_taken_from_a_folder_without_those_of_the_experiment(fol
         command.configure(command.Args(tmp_path, perturbed.SMOKE, up="y"))
 
     (folder / "bottle").rename(folder / "jar")
-    one = command.configure(command.Args(tmp_path / "run", perturbed.SMOKE, objects=folder)).collection
+    one = command.configure(command.Args(tmp_path / "run", smoke_of_few(perturbed), objects=folder)).collection
     assert one.meshes is not None
     assert one.meshes.labels == ("box",) * 3 + ("jar",) * 4
 
 
 def test_unknown_classes_and_too_few_objects_are_refused(folder, tmp_path):
-    args = command.Args(tmp_path / "run", freefall.SMOKE, classes=("bottle", "teapot"))
+    args = command.Args(tmp_path / "run", smoke_of_few(freefall), classes=("bottle", "teapot"))
     with pytest.raises(ValueError, match=r"category is 'teapot', but it must be one of .*bottle"):
         command.configure(args)
     with pytest.raises(ValueError, match=r"teapot.*bottle, box"):
         command.configure(dataclasses.replace(args, objects=folder))
-    with pytest.raises(ValueError, match=r"the split .* needs at least 4 usable objects, but .* has 3: add objects"):
+    with pytest.raises(ValueError, match=r"num_objects is 3, .* at least 4 objects are needed: add usable objects"):
         command.configure(dataclasses.replace(args, objects=folder, classes=("box",)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"num_objects": 5}, r"num_objects is 5, so the part 'validation' .* at least 6 objects are needed: raise"),
+        ({"num_objects": 0}, "num_objects must be a whole number of at least 1, got 0"),
+        ({"shares": (0.8, 0.0, 0.2)}, r"collection\.shares must be > 0 for train, validation, test, got \(0\.8, 0\.0"),
+        ({"shares": (0.9, 0.1, 0.0)}, r"shares must be > 0"),
+        ({"seed": -1}, "seed must be a whole number of at least 0, got -1"),
+        ({"resolution": (0, 0)}, "resolution must be two whole numbers of pixels"),
+        ({"scenario": physics.Freefall(friction=(0.8, 0.4))}, r"scenario\.friction is \(0\.8, 0\.4\), but"),
+    ],
+)
+def test_a_collection_that_cannot_be_used_is_refused_before_anything_is_written(changes, message, tmp_path):
+    wrong = dataclasses.replace(freefall.SMOKE, collection=dataclasses.replace(freefall.SMOKE.collection, **changes))
+    with pytest.raises(ValueError, match=message):
+        command.configure(command.Args(tmp_path / "run", wrong))
+    with pytest.raises(ValueError, match=message):
+        stages.main(wrong, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_smallest_number_of_objects_in_the_message_is_enough():
+    """For each preset, the number in the message is compared with the split of the dataset."""
+    for experiment in (freefall, inclined, perturbed, released):
+        for preset in experiment.PRESETS.values():
+
+            def of(count, preset=preset):
+                collection = dataclasses.replace(preset.collection, num_objects=count, num_full=0)
+                return dataclasses.replace(preset, collection=collection, splits=("object",))
+
+            with pytest.raises(ValueError, match="objects are needed") as caught:
+                config.check(of(2))
+            least = int(re.search(r"at least (\d+) objects", str(caught.value))[1])
+            config.check(of(least))
+            assert min(map(len, dataset.split_objects(of(least).collection).values())) >= 1
+            assert min(map(len, dataset.split_objects(of(least - 1).collection).values())) == 0
+
+
+def test_a_split_by_trajectory_needs_two_parts():
+    few = dataclasses.replace(
+        freefall.SMOKE.collection, num_objects=1, num_per_object=2, num_full=0, shares=(0.7, 0.1, 0.2)
+    )
+    with pytest.raises(ValueError, match=r"trajectories with images is 2, so the part 'test' .* at least 3 traj"):
+        config.check(dataclasses.replace(freefall.SMOKE, collection=few, splits=("trajectory",)))
+    enough = dataclasses.replace(few, num_per_object=3)
+    config.check(dataclasses.replace(freefall.SMOKE, collection=enough, splits=("trajectory",)))
 
 
 def test_objects_left_out_by_the_collection_are_listed_once(tmp_path, monkeypatch):
@@ -318,7 +372,7 @@ def test_a_second_run_keeps_the_listing_of_the_first(folder, tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "objects.txt").write_text("of the first\n")
     with storage.lock(tmp_path / "run"), pytest.raises(storage.LockedError):
-        command.configure(command.Args(tmp_path / "run", freefall.SMOKE, objects=folder))
+        command.configure(command.Args(tmp_path / "run", smoke_of_few(freefall), objects=folder))
     assert (tmp_path / "run" / "objects.txt").read_text() == "of the first\n"
 
 

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import math
 import time
+from pathlib import Path
 
 import calibration_images
 import cv2
@@ -15,7 +16,7 @@ import sts_jax as sts
 from benchmarks.instruments.led_peer import Peer
 from benchmarks.instruments.sensor_peer import DARK, LIT, Lights, SeenController, SeenLights
 from experiments import commission
-from experiments.shared import backgrounds, boards
+from experiments.shared import backgrounds, boards, commissioning
 from sts_jax import hardware
 from sts_jax.hardware import Device, capture
 
@@ -188,12 +189,12 @@ def test_an_interrupted_run_resumes_and_writes_a_file_that_opens_the_sensor(peer
         hardware.STS.from_file(config.out).connect()
     camera = hardware.Camera(hardware.CameraConfig("http://127.0.0.1:9/video"))
     with pytest.raises(ValueError, match=r"board/camera.json was made with camera = "):
-        commission.claim_pictures(config, camera)
+        commissioning.claim_pictures(config, camera)
     with (
         hardware.Leds.connect(peer.path) as leds,
         pytest.raises(ValueError, match=r"contains the sensor file of the camera .*give another"),
     ):
-        commission.check_folder(config, camera, leds)
+        commissioning.check_folder(config, camera, leds)
 
 
 def test_another_controller_on_the_port_is_refused(tmp_path, peer):
@@ -232,7 +233,7 @@ def test_the_controller_is_found_by_its_own_serial_number(tmp_path, monkeypatch)
 
 def test_the_lens_is_fitted_from_a_folder(tmp_path, pictures, capsys):
     folder = held(tmp_path / "board", pictures)
-    lens = commission.fit(boards.Pictures.read(folder, hardware.Board(), (WIDTH, HEIGHT)), PINHOLE)
+    lens = commissioning.fit(boards.Pictures.read(folder, hardware.Board(), (WIDTH, HEIGHT)), PINHOLE)
     np.testing.assert_allclose(lens.center, TRUE.center, atol=5e-4)
     printed = capsys.readouterr().out
     assert "6 pictures" in printed
@@ -454,7 +455,7 @@ def test_the_board_is_printed(tmp_path, capsys):
 )
 def test_bad_options_are_named(config, changes, message):
     if "board_images" in changes:
-        changes = {**changes, "board_images": commission.Path(changes["board_images"])}
+        changes = {**changes, "board_images": Path(changes["board_images"])}
     with pytest.raises((ValueError, OSError), match=message):
         commission.main(dataclasses.replace(config, **changes))
 

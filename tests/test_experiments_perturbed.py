@@ -10,6 +10,7 @@ from PIL import Image
 
 import sts_jax as sts
 from benchmarks import deterministic, recognise, scaling
+from benchmarks.instruments.experiments import EXPERIMENTS
 from experiments import perturbed, show
 from experiments.shared import stages
 from sts_jax import dataset, evaluation, physics
@@ -140,7 +141,7 @@ def test_pictures_for_recognition_come_with_their_answers(workdir, tmp_path, mon
 @pytest.fixture
 def tiny_preset(monkeypatch):
     """The run of this file as a preset that benchmarks know."""
-    monkeypatch.setitem(deterministic.EXPERIMENTS, "perturbed", types.SimpleNamespace(PRESETS={"smoke": TINY}))
+    monkeypatch.setitem(EXPERIMENTS, "perturbed", types.SimpleNamespace(PRESETS={"smoke": TINY}))
 
 
 @pytest.mark.usefixtures("tiny_preset")

@@ -1,5 +1,6 @@
 import dataclasses
 import re
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import sts_jax as sts
 from experiments import sense
+from experiments.shared import laying
 
 pytestmark = pytest.mark.slow
 
@@ -39,8 +41,8 @@ def test_all_streams_of_a_class_in_one_picture(tmp_path, capsys):
     assert re.fullmatch(r"[\d.e-]+ s a frame of 32 x 24 \([\d.]+ s the first\)", lines[3])
     assert lines[4] == str(out)
 
-    body, sensor = sense.read(config, "bottle"), sts.Sensor()
-    pose, wrench, _ = sense.lay(config, sensor, body)
+    body, sensor = laying.read(config, "bottle"), sts.Sensor()
+    pose, wrench, _ = laying.lay(config, sensor, body)
     given = (jnp.asarray(x, jnp.float32) for x in (pose, wrench))
     frame = sts.sense(sensor, body, *given, resolution=TINY)
     picture = np.asarray(Image.open(out))
@@ -59,10 +61,10 @@ def test_all_streams_of_a_class_in_one_picture(tmp_path, capsys):
 
 def test_a_file_is_pressed_by_its_weight(box, tmp_path, capsys):
     config = sense.Config(str(box), out=tmp_path / "box.png", resolution=TINY, mass=0.2, crop=True)
-    body, sensor = sense.read(config, str(box)), sts.Sensor()
+    body, sensor = laying.read(config, str(box)), sts.Sensor()
     frame, _, words = sense.look(config, sensor, body)
     assert "0.2 kg, pressed by 1.96 N" in words
-    assert float(frame.pressure.sum()) * 1e-6 == pytest.approx(0.2 * sense.G, rel=0.005)
+    assert float(frame.pressure.sum()) * 1e-6 == pytest.approx(0.2 * laying.G, rel=0.005)
     # its largest face, 40 x 30 mm, by p = k d
     assert "deepest imprint 0.82 mm, contact area 1200 mm2, balanced" in words
     assert bool(frame.balanced)
@@ -72,10 +74,10 @@ def test_a_file_is_pressed_by_its_weight(box, tmp_path, capsys):
 
 def test_the_object_lies_at_the_configured_place(box):
     config = sense.Config(str(box), mass=0.1, position=(0.02, -0.01), turn=90.0)
-    body = sense.read(config, str(box))
+    body = laying.read(config, str(box))
 
     def corners(config):
-        pose, wrench, words = sense.lay(config, sts.Sensor(), body)
+        pose, wrench, words = laying.lay(config, sts.Sensor(), body)
         w, x, y, z = pose[3:]
         return Rotation.from_quat([x, y, z, w]).apply(np.asarray(body.vertices, float)) + pose[:3], wrench, words
 
@@ -101,7 +103,7 @@ def test_a_round_object_keeps_the_orientation_of_its_file(tmp_path):
     path = tmp_path / "ball.stl"
     trimesh.creation.icosphere(subdivisions=3, radius=0.02).export(path)
     config = sense.Config(str(path))
-    pose, _, words = sense.lay(config, sts.Sensor(), sense.read(config, str(path)))
+    pose, _, words = laying.lay(config, sts.Sensor(), laying.read(config, str(path)))
     assert pose[2] == pytest.approx(0.02, rel=0.01)
     assert "that it can rest on" in words
 
@@ -125,7 +127,7 @@ def test_a_sensor_of_a_file_is_used(box, tmp_path):
     soft = sense.look(
         sense.Config(str(box), resolution=TINY, mass=0.1),
         sts.Sensor.load(path),
-        sense.read(sense.Config(str(box), mass=0.1), str(box)),
+        laying.read(sense.Config(str(box), mass=0.1), str(box)),
     )[2]
     assert "deepest imprint 0.82 mm" in soft
 
@@ -154,7 +156,7 @@ def test_a_sensor_of_a_file_is_used(box, tmp_path):
 def test_an_invalid_option_is_refused_before_a_picture_is_written(box, tmp_path, monkeypatch, changes, message):
     monkeypatch.chdir(tmp_path)
     changes = {"mesh": str(box), "out": tmp_path / "a.png", "resolution": TINY} | changes
-    config = sense.Config(**{**changes, "out": sense.Path(changes["out"])})
+    config = sense.Config(**{**changes, "out": Path(changes["out"])})
     with pytest.raises((ValueError, OSError), match=message):
         sense.main(config)
     assert not (tmp_path / "a.png").exists()

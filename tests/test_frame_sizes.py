@@ -12,7 +12,7 @@ import trimesh
 from optics_bodies import from_trimesh
 
 import sts_jax as sts
-from experiments.sense import Config, lay
+from experiments.shared.laying import Config, lay
 from sts_jax import geometry, objects, tactile
 
 pytestmark = pytest.mark.slow

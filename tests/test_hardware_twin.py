@@ -23,7 +23,7 @@ import tyro
 from led_simulator import until
 
 import sts_jax as sts
-from experiments import twin as command
+from experiments.shared import twin_device
 from sts_jax import hardware
 from sts_jax.hardware import Lens, protocol, twin
 
@@ -564,13 +564,13 @@ def test_faults_of_the_camera_reach_opencv(served):
 
 def test_command_makes_the_twin_of_its_options():
     config = tyro.cli(
-        command.Config, args=["--resolution", "24", "32", "--imperfections.lag-s", "0.1", "--field-of-view", "None"]
+        twin_device.Config, args=["--resolution", "24", "32", "--imperfections.lag-s", "0.1", "--field-of-view", "None"]
     )
-    with command.make(config) as device:
+    with twin_device.make(config) as device:
         assert device.imperfections.lag_s == 0.1
         assert device.capture()[1].shape == (24, 32, 3)
     with pytest.raises(ValueError, match="must be one of"):
-        command.make(dataclasses.replace(config, object_class="unicorn"))
+        twin_device.make(dataclasses.replace(config, object_class="unicorn"))
 
 
 @pytest.mark.slow

@@ -18,7 +18,6 @@ from sts_jax import dataset, storage
 from sts_jax.compilation import cache_folder
 
 Preset = TypeVar("Preset")  # type of a configuration
-LEAST_OBJECTS = 10  # smallest number of usable objects in a folder, so that some can be used for validation and test
 
 
 def _folder(words: list[str]) -> Path:
@@ -174,7 +173,7 @@ def with_meshes(
 
     Raises:
         FileNotFoundError: The folder does not exist.
-        ValueError: A class is unknown, or the folder has too few usable objects.
+        ValueError: A class is unknown, or the folder has no usable object.
         LockedError: Another process works in the work directory.
     """
     there = dataset.mesh_classes(folder)
@@ -199,12 +198,6 @@ def with_meshes(
             storage.write_bytes(path, listing.encode())
     say(f"classes used: {', '.join(taken)}" + (f". Left out: {', '.join(others)}" if others else ""))
     say(f"{len(meshes.names)} objects can be used. {path} lists these and the objects left out")
-    if len(meshes.names) < LEAST_OBJECTS:
-        raise ValueError(
-            f"the split into training, validation and test needs at least {LEAST_OBJECTS} usable objects, but "
-            f"--objects {folder} has {len(meshes.names)}: add objects. {path} lists the unusable objects and their "
-            "problems"
-        )
     each, rendered = (
         max(count, round(collection.num_objects * count / len(meshes.names)))
         for count in (collection.num_per_object, collection.rendered_per_object)

@@ -199,7 +199,8 @@ def check(config: Config) -> None:
 def _check_parts(collection: dataset.Collection, split: str) -> None:
     """Raise a `ValueError` unless each part of a split of the dataset contains at least one object or trajectory."""
     shares, count = np.array(collection.shares), collection.num_objects
-    parts, items, few = PARTS, "objects", f"collection.num_objects is {count}"
+    parts: tuple[str, ...] = PARTS
+    items, few = "objects", f"collection.num_objects is {count}"
     if split == "trajectory":
         rest = evaluation.train_share(collection.shares, split)
         shares, count = np.array([rest, 1 - rest]), count * collection.rendered_per_object
@@ -214,10 +215,13 @@ def _check_parts(collection: dataset.Collection, split: str) -> None:
             "--collection.shares 0.7 0.1 0.2, for example"
         )
     least = next(n for n in itertools.count(count + 1) if min(_sizes(shares, n)) >= 1)
+    more = "raise --collection.num-objects"
+    if collection.meshes is not None:
+        more = "add usable objects to the folder (objects.txt in the work directory lists the unusable ones)"
     raise ValueError(
         f"{few}, so the part {empty[0]!r} of the split by {split} has no {items}. With collection.shares "
-        f"{collection.shares}, at least {least} {items} are needed: raise --collection.num-objects, or give other "
-        "--collection.shares"
+        f"{collection.shares}, at least {least} {items} are needed: {more}, or give other --collection.shares, such as "
+        "0.7 0.1 0.2"
     )
 
 

@@ -124,5 +124,6 @@ class PanelFile:
             self._writer.release()
         elif self._panels:
             chosen = np.unique(np.linspace(0, len(self._panels) - 1, _ROWS).round().astype(int))
-            Image.fromarray(np.vstack([self._panels[index] for index in chosen])).save(self._path)
+            picture = Image.fromarray(np.vstack([self._panels[index] for index in chosen]))
+            output.write_picture(self._path, picture)
         return self._writer is not None or bool(self._panels)

@@ -1,7 +1,13 @@
-"""Checks output paths before a command starts its work."""
+"""Checks output paths before a command starts its work, and writes pictures atomically."""
 
+import io
 import tempfile
 from pathlib import Path
+
+from matplotlib.figure import Figure
+from PIL import Image
+
+from sts_jax import storage
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".pdf")  # formats that Pillow and Matplotlib write
 
@@ -49,3 +55,35 @@ def _write(folder: Path) -> None:
         tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
         raise type(error)(f"the folder {folder} cannot be written to ({error.strerror}): give another path") from error
+
+
+def write_picture(path: Path, picture: Image.Image) -> None:
+    """Write a picture atomically, in the format that belongs to the suffix of the path.
+
+    Args:
+        path: The file. Its suffix must be one of `PICTURES`.
+        picture: The picture.
+
+    Raises:
+        OSError: The file cannot be written. The message names the file and the remedy.
+    """
+    buffer = io.BytesIO()
+    picture.save(buffer, Image.registered_extensions()[path.suffix.lower()])
+    storage.write_bytes(path, buffer.getvalue())
+
+
+def write_figure(path: Path, figure: Figure, *, dpi: float) -> None:
+    """Write a figure atomically, in the format that belongs to the suffix of the path.
+
+    Args:
+        path: The file. If it has no suffix, the format is PNG.
+        figure: The figure.
+        dpi: Resolution (pixels per inch).
+
+    Raises:
+        ValueError: Matplotlib does not know the format.
+        OSError: The file cannot be written. The message names the file and the remedy.
+    """
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=path.suffix[1:] or "png", dpi=dpi)
+    storage.write_bytes(path, buffer.getvalue())

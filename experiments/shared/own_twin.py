@@ -9,7 +9,7 @@ import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
-from experiments import commission
+from experiments.shared import commissioning
 
 SIZE = (640, 480)  # width and height of the images (pixels)
 FIELD_OF_VIEW = 160.0  # field of view across the diagonal (degrees)
@@ -73,7 +73,7 @@ class OwnTwin:
 def own_twin(folder: Path, *, seed: int = 0) -> Iterator[OwnTwin]:
     """Start a digital twin of the sensor in another process, and stop the twin at the end of the `with` block.
 
-    Before the block, `experiments.commission` writes the sensor file of the twin.
+    Before the block, `commissioning.commission` writes the sensor file of the twin.
 
     Args:
         folder: Empty folder, which receives the sensor file and a link to the twin's virtual serial port.
@@ -91,8 +91,8 @@ def own_twin(folder: Path, *, seed: int = 0) -> Iterator[OwnTwin]:
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, start_new_session=True) as process:
         try:
             url = _address(process)
-            commission.main(
-                commission.Config(
+            commissioning.commission(
+                commissioning.Config(
                     camera=f"{url}/camera",
                     leds=str(leds),
                     out=folder,

@@ -117,4 +117,4 @@ def draw(folder: Path, numbers: tuple[int, ...], path: Path) -> None:
         pen.text((6, head + row * (height + 4) + height // 2 - 8), str(number), fill="black", font=font)
         for column, image in enumerate(images):
             sheet.paste(Image.fromarray(image), (margin + column * (PANEL + 4), head + row * (height + 4)))
-    sheet.save(path)
+    output.write_picture(path, sheet)

@@ -343,6 +343,8 @@ def auc(positive: np.ndarray, score: np.ndarray, weight: np.ndarray | None = Non
     Returns:
         The area. It is NaN if no item is positive, or if no item is negative. Items with the weight 0 are ignored.
     """
+    # scikit-learn's roc_auc_score gives the same value, but takes about thirty times as long. The bootstrap of the
+    # intervals calls this function thousands of times.
     w = np.ones(len(score)) if weight is None else weight
     _, place = np.unique(score, return_inverse=True)
     above, below = (np.bincount(place, w * kind, place.max() + 1) for kind in (positive, ~positive))

@@ -144,11 +144,20 @@ def paper_model(
 
     Returns:
         The configuration of an `mvae` model.
+
+    Raises:
+        ValueError: `modalities` has a name other than `visual`, `tactile` and `pose`.
     """
-    pose = mvae.Modality("pose", "vector", (preprocessing.pose_size,), weight=1000.0)
     shape = (*preprocessing.resolution, 3)
-    images = {name: mvae.Modality(name, "image", shape, start=0.7) for name in ("visual", "tactile")}
-    kept = [{**images, "pose": pose}[name] for name in modalities]
+    known = {name: mvae.Modality(name, "image", shape, start=0.7) for name in ("visual", "tactile")}
+    known["pose"] = mvae.Modality("pose", "vector", (preprocessing.pose_size,), weight=1000.0)
+    for name in modalities:
+        if name not in known:
+            raise ValueError(
+                f"modalities contains {name!r}, but it may contain only {', '.join(map(repr, known))}: specify another "
+                "modality as a dataset.Measurement in the argument measurements"
+            )
+    kept = [known[name] for name in modalities]
     kept += [
         mvae.Modality(own.name, "image" if own.is_image else "vector", own.shape, weight=float(own.weight))
         for own in measurements
