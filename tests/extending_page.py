@@ -1,12 +1,13 @@
-"""The code of `docs/extending.md`, for the tests that execute it."""
+"""The code of `docs/extending.md` and of other pages, for the tests that execute it."""
 
 import re
 from pathlib import Path
 
-PAGE = Path(__file__).parents[1] / "docs" / "extending.md"
+DOCS = Path(__file__).parents[1] / "docs"
 
 
-def blocks(title: str) -> list[str]:
-    """The blocks of Python in the section of this title."""
-    (section,) = [part for part in PAGE.read_text().split("\n## ")[1:] if part.startswith(f"{title}\n")]
+def blocks(title: str, page: str = "extending") -> list[str]:
+    """The blocks of Python in the section of this title on a page of the documentation."""
+    parts = (DOCS / f"{page}.md").read_text().split("\n## ")[1:]
+    (section,) = [part for part in parts if part.startswith(f"{title}\n")]
     return re.findall(r"```python\n(.*?)```", section, re.DOTALL)

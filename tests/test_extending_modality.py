@@ -1,13 +1,14 @@
 """A further modality from one specification, from the dataset to the table, as `docs/extending.md` shows."""
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from extending_page import blocks
+from extending_page import DOCS, blocks
 
 import sts_jax as sts
 from sts_jax import dataset, evaluation, mvae, training
@@ -348,3 +349,12 @@ def test_a_paper_model_without_further_modalities_is_unchanged():
     assert training.paper_model(("pose",), preprocessing).modalities == (
         mvae.Modality("pose", "vector", (12,), weight=1000.0),
     )
+
+
+def test_the_page_names_files_and_functions_that_a_modality_of_a_state_space_model_changes():
+    rows = re.findall(r"^\| `([\w/]+\.py)` \| (.*) \|$", (DOCS / "extending.md").read_text(), re.MULTILINE)
+    assert len(rows) == 9
+    for path, change in rows:
+        code = (DOCS.parent / path).read_text()
+        for name in re.findall(r"`(?:\w+\.)?(\w+)`", change):
+            assert re.search(rf"\b{name}\b", code), f"{path} has no {name}"
