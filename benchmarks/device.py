@@ -96,10 +96,10 @@ def serve(link: multiprocessing.connection.Connection, path: Path, lag_s: float,
 
     Args:
         link: Connection to the reading process. This function first sends the address of the camera. The reading
-            process then sends MOVE any number of times and FINISHED once. MOVE holds or releases the object of the
-            digital twin (a simulated sensor), and has no effect without the twin. The answer to FINISHED is the
-            camera's log. The log maps the key of each image to the mean light during the exposure (`Shown`). The key is
-            a checksum of the pixels with the twin, and the number of the frame without the twin.
+            process then sends MOVE any number of times and FINISHED once. If `twin` is True, MOVE releases a held
+            object, and holds the object otherwise. If `twin` is False, MOVE has no effect. The answer to FINISHED is
+            the camera's log. The log maps the key of each image to the mean light during the exposure (`Shown`). The
+            key is a checksum of the pixels if `twin` is True, and the number of the frame if `twin` is False.
         path: Path at which a symbolic link to the controller's port is created.
         lag_s: Time from the end of an exposure to the sending of the frame (s).
         twin: True for images of the digital twin, a simulated sensor. False for images of one colour.

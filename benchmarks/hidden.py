@@ -157,8 +157,8 @@ def losses(study: Study, items: list[objects.Body], starts: Starts, touch: np.nd
         study: Settings of the scenario.
         items: The objects.
         starts: Initial states and outcomes of trajectories of these objects, with one row for each trajectory.
-        touch: Measurement of touch, such as the logarithm of the mass, `(n, k)`, nan without contact. None: the
-            classifier has vision only.
+        touch: Quantity that the sense of touch determines, such as the logarithm of the mass, `(n, k)`, nan without
+            contact. None: the classifier has vision only.
 
     Returns:
         The loss of each trajectory, `(n,)`, from a classifier that was fitted to other objects.

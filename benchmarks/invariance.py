@@ -342,10 +342,10 @@ def sides(case: Case, num: int) -> dict[str, np.ndarray]:
 
 
 def compare(found: dict[str, np.ndarray], labels: Sequence[str], margin: float = MARGIN) -> bool:
-    """Print the share of every label on the side "ours" and on each other side, with the interval of the difference.
+    """Print how often the runs end in each way, compared between the side "ours" and each other side.
 
     A side is one way to compute the same runs, such as another time step or another physics engine. The label of a run
-    states how the run ends, such as "lies".
+    states how the run ends, such as "lies". The shares of each label are printed with the interval of their difference.
 
     Args:
         found: Index of the label of every run, by name of the side. The side "ours" must be the first.

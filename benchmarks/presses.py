@@ -248,8 +248,8 @@ def start(given: Pixels, *, near: bool) -> dict[str, Array]:
 def refine(unknowns: dict[str, Array], given: Pixels, *, near: bool, steps: int) -> dict[str, Array]:
     """Fit the unknowns of `shader` to the colours of pixels.
 
-    Adam with a cosine schedule minimises the mean squared difference between the colours that `draw` computes from the
-    unknowns and the real colours.
+    `draw` computes the colours of the pixels from the unknowns. Adam with a cosine schedule minimises the mean squared
+    difference of these colours from the real colours.
     """
     optimiser = optax.adam(optax.cosine_decay_schedule(RATE, steps))
 

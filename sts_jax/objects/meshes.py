@@ -336,8 +336,8 @@ def _body(
             )
         if holds:
             warnings.warn(
-                f"{path}: the mesh {fault}. The contents of the object can therefore fill the whole convex hull of "
-                f"the mesh ({hull.volume * 1e6:.3g} ml)",
+                f"{path}: the mesh {fault}, so its interior is unknown. The convex hull of the mesh is used as the "
+                f"space that the object's liquid or granular contents can fill ({hull.volume * 1e6:.3g} ml)",
                 stacklevel=3,
             )
         if len(hull.simplices) > max(len(faces), len(vertices)):  # keeps the body in its size class

@@ -277,7 +277,8 @@ class Transition(nnx.Module):
 class Decoder(nnx.Module):
     """Renders an object in a given pose, from its shape and its appearance code.
 
-    The shape is part of the state code. The appearance code describes all visible properties other than pose and shape.
+    The shape is a part of the state code, a vector that describes the object's pose, shape and mass. The appearance
+    code describes all other visible properties.
 
     The network renders the object on a canvas: a square that is parallel to the pad and aligned with the object's
     heading. The heading is a direction parallel to the pad, and it turns with the object. The centre of the canvas is

@@ -108,9 +108,9 @@ def _check_state(model: statespace.Config, arrays: Arrays) -> None:
     """Raise a ValueError if a training set does not fit a state-space model."""
     if arrays.target_present or not set(arrays.present) <= set(model.inputs):
         raise ValueError(
-            f"`present` has masks for {sorted(arrays.present)}, `target_present` has masks for "
-            f"{sorted(arrays.target_present)}, but a state-space model allows masks only in `present`, for the "
-            f"model's inputs {list(model.inputs)}: remove all other masks"
+            f"the training set of a state-space model may have masks only for the model's inputs {list(model.inputs)} "
+            f"in `present`, and no masks in `target_present`: remove all other masks. `present` has masks for "
+            f"{sorted(arrays.present)}. `target_present` has masks for {sorted(arrays.target_present)}"
         )
     size, small = (model.input_size,) * 2, (model.image_size,) * 2
     codes, images = {"state": (statespace.STATE_CODE,), "pose": (statespace.POSE_CODE,)}, statespace.IMAGES
@@ -158,8 +158,8 @@ def _check_condition(expected: int, arrays: Arrays) -> None:
     width = 0 if arrays.condition is None else arrays.condition.shape[1]
     if width != expected:
         raise ValueError(
-            f"`condition` has width {width}, but the model needs width {expected}: give a condition of width "
-            f"{expected} (None if the width is 0), or a model with condition={width}"
+            f"`condition` has width {width}, but the model needs width {expected}: give "
+            f"{f'a condition of width {expected}' if expected else 'condition=None'}, or a model with condition={width}"
         )
 
 

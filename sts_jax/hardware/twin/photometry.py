@@ -141,7 +141,7 @@ class Blender:
         return Ends(self._end(visual), self._end(tactile))
 
     def blend(self, ends: Ends, light: float) -> np.ndarray:
-        """Mix the images of the scene with LEDs off and with LEDs on into a camera frame without noise.
+        """Make a camera frame without noise, as a mixture of an image with LEDs off and an image with LEDs on.
 
         If `Imperfections.leakage` and `Imperfections.vignetting` are 0 and there is no lens distortion, the frame
         equals the image of `sts_jax.expose` up to rounding.
@@ -159,7 +159,7 @@ class Blender:
         return self._to_srgb[self._mixed(ends, light)]
 
     def frame(self, ends: Ends, light: float) -> np.ndarray:
-        """Mix the images of the scene with LEDs off and with LEDs on into a camera frame, and add the noise.
+        """Make a camera frame with noise, as a mixture of an image with LEDs off and an image with LEDs on.
 
         Args:
             ends: Images of the scene, as `Blender.ends` returns them.
