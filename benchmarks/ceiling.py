@@ -58,7 +58,7 @@ def spread(start: np.ndarray, end: np.ndarray, outcome: np.ndarray) -> list[str]
     Args:
         start: First poses, `(n, 7)`.
         end: Last poses of the repeated simulations of each start, `(times, n, 7)`.
-        outcome: Number of the `physics.Outcome` of each simulation, such as `FELL_OFF`, int `(times, n)`.
+        outcome: Outcome of each simulation, a value of the enum `physics.Outcome` such as `FELL_OFF`, int `(times, n)`.
 
     Returns:
         Four lines of text: the number of starts, the distance of the last positions from the first position, their

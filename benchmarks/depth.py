@@ -175,7 +175,8 @@ def measure(
 ) -> dict[str, Difference]:
     """Compare the depth in rendered frames with the depth that the ray tracer embree computes.
 
-    Embree traces the object in the pose `Frame.pose`, which `sense` draws after the object has sunk into the gel.
+    Embree traces the object in the same pose in which `sense` renders it. This pose is the field `Frame.pose`, the pose
+    after the object has sunk into the gel.
 
     Args:
         names: Names of the objects, from `PROCEDURAL`, `LOADED` and `MADE`.

@@ -16,9 +16,9 @@ measures its settling times, from a switch of the light to the first frame that 
 camera logs the light during each exposure. An image counts as one of a wrong or mixed light if, in this log, the mean
 light of its exposure differs from the requested light by more than 0.1 % of the full light.
 
-The camera needs at least two frame periods and one settling time per pair, which limits the rate. The light is switched
-once per pair, alternately on and off. The limit is therefore computed with the mean of the settling times for on and
-off.
+The camera needs at least two frame periods and one settling time per pair, which limits the rate. The order of the two
+images alternates from pair to pair, so the light is switched only once per pair: on in one pair, and off in the next
+pair. The limit is therefore computed with the mean of the settling times for on and off.
 """
 
 import dataclasses
@@ -96,10 +96,11 @@ def serve(link: multiprocessing.connection.Connection, path: Path, lag_s: float,
 
     Args:
         link: Connection to the reading process. This function first sends the address of the camera. The reading
-            process then sends MOVE any number of times and FINISHED once. If `twin` is True, MOVE releases a held
-            object, and holds the object otherwise. If `twin` is False, MOVE has no effect. The answer to FINISHED is
-            the camera's log. The log maps the key of each image to the mean light during the exposure (`Shown`). The
-            key is a checksum of the pixels if `twin` is True, and the number of the frame if `twin` is False.
+            process then sends MOVE any number of times and FINISHED once. If `twin` is True, MOVE releases the object
+            if it is held, and holds the object if it is not held. If `twin` is False, MOVE has no effect. The answer to
+            FINISHED is the camera's log. The log maps the key of each image to the mean light during the exposure
+            (`Shown`). The key is a checksum of the pixels if `twin` is True, and the number of the frame if `twin` is
+            False.
         path: Path at which a symbolic link to the controller's port is created.
         lag_s: Time from the end of an exposure to the sending of the frame (s).
         twin: True for images of the digital twin, a simulated sensor. False for images of one colour.

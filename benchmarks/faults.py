@@ -376,9 +376,10 @@ def kill(bench: Bench, count: Count) -> None:
         _until(lambda: time.monotonic() > wait_s and lights.off_after(0.0) is None, 60)
         if process.poll() is not None or lights.off_after(0.0) is not None:
             raise RuntimeError(
-                "the benchmark could not kill the program that reads the sensor while a light was on, because the "
-                "program ended too early or no light was on within 60 s. The program's exit status (None: it still "
-                f"runs) is {process.poll()}. If the status is a number, see the program's error output above"
+                "the benchmark must kill the program that reads the sensor, at a moment when a light is on. This was "
+                "not possible, because the program ended too early or no light was on within 60 s. The program's exit "
+                f"status (None: it still runs) is {process.poll()}. If the status is a number, see the program's error "
+                "output above"
             )
         process.send_signal(signal.SIGKILL)
         process.wait()

@@ -83,7 +83,10 @@ def rates() -> None:
 
 
 def main(args: Args) -> None:
-    """Print the waiting times and the rates."""
+    """Print how long a new user waits for each first step, and how many frames and gradients are computed per second.
+
+    The option `--vmap` leaves out the waiting times.
+    """
     if not args.vmap:
         waiting()
     rates()

@@ -337,7 +337,8 @@ def main(args: Args) -> None:
     """Record the image folders `device` and `clean`, then print the table of distances between sets of images.
 
     Both folders contain images of the same scenes. The images of `device` have the default imperfections of the digital
-    twin, and the images of `clean` have almost none. The table compares the clean images with changed copies of them.
+    twin, and the images of `clean` have almost none. The table uses the images of `clean` only, and compares them with
+    each other and with changed copies. The command `python -m experiments.gap` can compare `device` with `clean`.
 
     Raises:
         ValueError: An option is out of range, or the work directory contains trajectories already.

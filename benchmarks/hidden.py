@@ -3,7 +3,7 @@
     python -m benchmarks.hidden                 # the jerked pad, about half an hour on two CPU cores
     python -m benchmarks.hidden outcomes truth  # two of the four parts, which are listed below
     python -m benchmarks.hidden --keep FOLDER   # keep the starts and outcomes in a folder, and resume from this folder
-    python -m benchmarks.hidden outcomes truth --scenario inclined --soaked FOLDER  # starts from `benchmarks.soak`
+    python -m benchmarks.hidden outcomes truth --scenario inclined --soaked FOLDER  # load stored trajectories
 
 Hidden properties are those that a camera cannot see, such as the fill level of a bottle. A start is the initial state
 of a trajectory. The outcome is how the trajectory ends, such as by toppling. The scenario `perturbed` is the jerked
@@ -27,6 +27,9 @@ object starts on a tilted pad or just above it. The parts are:
 Cross-validation folds and bootstrap samples (for 95 % intervals) contain all starts of an object or none. The starts
 are simulated with the defaults of the scenario. All results are printed. The features of the classifiers are in
 `benchmarks.instruments`.
+
+With `--soaked FOLDER`, the command does not simulate the starts, but loads the trajectories that
+`benchmarks.soak --keep FOLDER` has stored.
 """
 
 import dataclasses

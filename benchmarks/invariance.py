@@ -288,9 +288,10 @@ def named(case: Case, first: Array | np.ndarray, last: Array | np.ndarray) -> np
 
 
 def difference(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
-    """Compare the shares of runs with one label in two sets of runs, and return the 95 % interval of the difference.
+    """Return the 95 % confidence interval of the difference between the shares of one label in two sets of runs.
 
-    The label of a run names the state at its end. Run i of the first set is paired with run i of the second set.
+    The label of a run names the state at its end. The share of a label is the fraction of the runs that have this
+    label. Run i of the first set is paired with run i of the second set.
 
     Args:
         a: True for the runs of the first set that have the label, `(n,)`.
@@ -345,7 +346,8 @@ def compare(found: dict[str, np.ndarray], labels: Sequence[str], margin: float =
     """Print how often the runs end in each way, compared between the side "ours" and each other side.
 
     A side is one way to compute the same runs, such as another time step or another physics engine. The label of a run
-    states how the run ends, such as "lies". The shares of each label are printed with the interval of their difference.
+    states how the run ends, such as "lies". For each label and each other side, the share of the label on "ours", its
+    share on the other side, and the 95 % confidence interval of the difference between the two shares are printed.
 
     Args:
         found: Index of the label of every run, by name of the side. The side "ours" must be the first.

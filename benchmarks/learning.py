@@ -94,7 +94,11 @@ def stepper(model: mvae.Config, size: int, absent: tuple[str, ...]) -> Callable[
 
 
 def predictor(size: int) -> Callable[[], None]:
-    """Make a function that predicts all modalities of `MODEL` from `size` visual images, in one compiled call."""
+    """Make a function that predicts all modalities of `MODEL` for a batch of visual images, in one compiled call.
+
+    Args:
+        size: Batch size.
+    """
     graphdef, params, stats = mvae.init(jax.random.key(0), MODEL)
     state = nnx.merge_state(params, stats)
     run = jax.jit(lambda state, x: mvae.predict(graphdef, state, {"visual": x}))
@@ -103,7 +107,9 @@ def predictor(size: int) -> Callable[[], None]:
 
 
 def state_stepper(size: int) -> Callable[[], None]:
-    """Make a function that runs one compiled training step of freefall's state-space model on random data.
+    """Make a function that runs one compiled training step of a state-space model on random data.
+
+    The model has the default configuration, which fits the scenario `freefall`.
 
     Args:
         size: Batch size.

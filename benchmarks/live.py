@@ -3,12 +3,12 @@
     python -m benchmarks.live
 
 In the digital twin, a hand holds an object in an unstable pose and lets go. Each model predicts the images at rest from
-the images of the held object, as `experiments.live` does. The command prints the skill of the predicted images,
-computed from mean squared errors over all trajectories. The skill is 1 if the prediction of a trajectory is its true
-image at rest, and 0 if the prediction is the mean of the images at rest from all other trajectories. No model was
-trained with the twin's noise, vignetting and leaking light. The twin's object moves as in the scenario
-`physics.Released`. Only the model `released` was trained on this scenario, with objects of the same class as the twin's
-object.
+the images of the held object, as `experiments.live` does. The command prints the skill of the predicted images: one
+number for all trajectories together, computed from mean squared errors. The skill is 1 if each prediction is the true
+image at rest. It is 0 if the prediction for each trajectory is the mean of the images at rest from all other
+trajectories. No model was trained with the twin's noise, vignetting and leaking light. The twin's object moves as in
+the scenario `physics.Released`. Only the model `released` was trained on this scenario, with objects of the same class
+as the twin's object.
 """
 
 import dataclasses

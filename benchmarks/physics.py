@@ -235,10 +235,12 @@ def worlds(count: int, frames: int) -> tuple[Worlds, mjx.Model, mjx.Data]:
 def scaling(frames: int = 8, chunk: int = 32) -> None:
     """Measure steps per second against the number of worlds, and write a table and a plot to RESULTS.
 
+    Each number of worlds is measured three times: with MJX and one call for all worlds, with MJX and several calls in
+    parallel threads, and with C MuJoCo.
+
     Args:
         frames: Frames of each trajectory.
-        chunk: Number of worlds in each MJX call of the measurement with several threads. The other MJX measurement
-            simulates all worlds in one call.
+        chunk: Number of worlds in each of the parallel MJX calls.
     """
     gpu = jax.default_backend() != "cpu"
     counts = [4**k for k in range(9 if gpu else 7)]
@@ -280,7 +282,7 @@ def write_scaling(rows: Sequence[Speeds], device: str, chunk: int) -> None:
     Args:
         rows: Steps per second for each number of worlds.
         device: Name of the device, for the title.
-        chunk: Number of worlds in each MJX call of the measurement with several threads, for the legend.
+        chunk: Number of worlds in each MJX call of the measurement `Speeds.in_chunks`, for the legend.
     """
     from matplotlib.figure import Figure
 

@@ -3,9 +3,9 @@
     python -m benchmarks.presses    # about a minute. Writes benchmarks/results/presses/
 
 The package `taxim` 1.4.1 (MIT) contains 48 images (480x640, 0.0295 mm per pixel) of a ball of radius 2 mm that is
-pressed into a GelSight, the image without contact (the background), and the centre and radius of each contact. Within
-the contact, the skin has the normals of a sphere. `tactile.phong` is fitted to 36 of the presses, and every fourth
-press is held out. An image is modelled by
+pressed into a GelSight. The package also contains the image without contact (the background), and the centre and radius
+of each contact. Within the contact, the skin has the normals of a sphere. `tactile.phong` is fitted to 36 of the
+presses, and every fourth press is held out. An image is modelled by
 
     image = background (1 + phong(pressed) - phong(flat))
 
@@ -157,8 +157,8 @@ def shader(unknowns: dict[str, Array], *, near: bool) -> tuple[tactile.Phong, ta
         unknowns: The array `place`, `(m, 3)`, contains x and y of each light in mm, and the softplus inverse of the
             light's depth below the gel's face in mm. The arrays `color`, `(m, 3)`, `falloff`, `specular` and
             `shininess` contain the softplus inverses of these quantities.
-        near: True returns near lights (LEDs) at the positions `place`. False returns far lights in the directions
-            `place`, and ignores `falloff`.
+        near: True returns near lights (LEDs) at the positions (x, y, -depth). False returns far lights in the
+            directions (x, y, -depth), and ignores `falloff`.
 
     Returns:
         The constants of the reflectance, and the lights.
@@ -225,7 +225,9 @@ def _inverse(value: float | np.ndarray) -> Array:
 
 
 def start(given: Pixels, *, near: bool) -> dict[str, Array]:
-    """Return the initial lights and reflectance of the optimisation, as the argument `unknowns` of `shader`.
+    """Compute the lights and the reflectance from which the optimisation starts.
+
+    The result has the format of the argument `unknowns` of `shader`.
 
     Non-negative least squares selects the lights from candidates in rings around the image. The fall-off, the specular
     reflectance and the shininess start from constants.

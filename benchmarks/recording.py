@@ -36,7 +36,10 @@ class Args:
 
 
 def pair(random: np.random.Generator, width: int, height: int, noise: float) -> Pair:
-    """Make a smooth visual and a smooth tactile image. Their noise has the standard deviation `noise` (grey levels)."""
+    """Make a smooth visual and a smooth tactile image, and add noise to both.
+
+    The noise is normally distributed with the standard deviation `noise` (grey levels).
+    """
 
     def shot(stream: recordings.Stream, level: int) -> Shot:
         smooth = cv2.GaussianBlur(random.uniform(0, 1, (height, width, 3)).astype(np.float32), (0, 0), width / 50)

@@ -259,8 +259,8 @@ def cases() -> Iterator[Case]:
 def measure(case: Case) -> Durations:
     """Measure the seconds per frame of `sense` and of the ray tracer Embree.
 
-    Both are measured in one thread, and also in as many threads as there are cores. On a GPU, a call that renders a
-    batch replaces the measurement of `sense` in several threads.
+    Both are measured in one thread, and also in as many threads as there are cores. On a GPU, `sense` is not measured
+    in several threads. Instead, a single call of `sense` that renders a batch is measured.
     """
     cores, on_cpu = os.cpu_count() or 1, jax.default_backend() == "cpu"
     pool = concurrent.futures.ThreadPoolExecutor(cores)
@@ -301,8 +301,9 @@ def rates(case: Case, found: Durations) -> str:
 def shares(case: Case, found: Durations) -> str:
     """Format one case as a table row: the time of `sense` per frame (ms), and each stage's share of this time (%).
 
-    The stages are the balance of the gel, the depth, the visual image and the tactile image. For images of 640x480
-    pixels, the row also has the speed of `sense` relative to the paper's code.
+    The stages compute the equilibrium of the gel, the depth, the visual image and the tactile image. For images of
+    640x480 pixels, the row also has the speed of `sense` relative to the code of the paper (Rezaei-Shoshtari et al.
+    2021).
     """
     stages = [found.gel, found.depth - found.gel, found.visual - found.depth, found.tactile - found.depth]
     line = " ".join(f"{100 * stage / found.frame:9.0f}" for stage in stages)

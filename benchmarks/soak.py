@@ -92,11 +92,12 @@ def block(name: str, index: int, size: int) -> dict[str, np.ndarray]:
         size: Number of trajectories, a multiple of NUM.
 
     Returns:
-        Arrays by name, with a row for each trajectory. `wrench_error` is the length of (force of the pad at rest +
-        weight vector), divided by the weight. It is nan for trajectories whose object does not rest on the pad or
-        touches the wall. `excess` is the largest gain of energy since the first frame, over the frames without contact
-        (see `excess_energy`). It is -inf for trajectories whose object fell off or had contact in every frame. It is
-        nan for scenarios in which gravity changes.
+        Arrays by name, with a row for each trajectory. `wrench_error` is the difference between the force of the pad on
+        the resting object and the force that balances the object's weight. It is the length of the difference vector,
+        divided by the weight, and nan for trajectories whose object does not rest on the pad or touches the wall.
+        `excess` is the largest gain of energy since the first frame, over the frames without contact (see
+        `excess_energy`). It is -inf for trajectories whose object fell off or had contact in every frame. It is nan for
+        scenarios in which gravity changes.
     """
     scenario = SCENARIOS[name]
     first = index * size // NUM
@@ -136,7 +137,8 @@ def report(name: str, found: dict[str, np.ndarray]) -> str:
 
     Args:
         name: Name of the scenario.
-        found: Arrays by name, with a row for each trajectory of the scenario. `block` describes them.
+        found: Arrays with the names and meanings of the result of the function `block`, and with a row for each
+            trajectory of the scenario.
     """
     outcome = found["outcome"]
     shares = {o.name.lower(): np.mean(outcome == o) for o in SCENARIOS[name].outcomes}

@@ -61,7 +61,7 @@ def timed(call: Callable[[], object], number: int) -> float:
 
 
 def held(size: tuple[int, int], exposure_s: float) -> tuple[twin.Twin, twin.ObjectScene]:
-    """Make a digital twin of the sensor, and its scene with one object of the object class "camera".
+    """Make a digital twin of the sensor and a scene for it. The object in the scene has the shape of a photo camera.
 
     The lens of the twin has a field of view of 160 degrees. The pad is empty until the twin receives the command
     `hold`, which places the object on the pad.
@@ -99,7 +99,11 @@ def served(size: tuple[int, int], number: int) -> float:
 
 
 def main(args: Args) -> None:
-    """Print a line with the rates of the twin on one CPU core for each image size in SIZES."""
+    """Measure the digital twin on one CPU core, and print one line for each image size in SIZES.
+
+    A line has the times to render a pose, to make a noisy frame and to encode this frame as JPEG. It also has the rate
+    at which the twin makes frames, and the rate at which a second process receives frames.
+    """
     core = min(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {core})
     for size in SIZES:

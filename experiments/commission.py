@@ -64,7 +64,8 @@ def find(config: Config) -> str:
 def main(config: Config) -> None:
     """Measure the camera, the lights and the lens of a sensor, and write the sensor file.
 
-    With `print_board`, only write the calibration board. Without `camera` or `leds`, only list the devices.
+    With `print_board`, only write the calibration board. If at least one of `camera` and `leds` is None, only list the
+    devices to choose from.
     """
     if config.print_board is not None:
         hardware.save_board(config.print_board)

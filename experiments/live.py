@@ -77,7 +77,7 @@ class Config:
 class Source:
     """The source of the live images: a sensor, a digital twin or a recording.
 
-    The function `follow` connects the sensor or the recording, and reads the images.
+    The function `follow` connects to the source, and reads its images.
     """
 
     name: str  # description for the title of the page

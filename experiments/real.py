@@ -1,7 +1,7 @@
 """Collect and review trajectories of the real sensor or its digital twin, and learn from them (the paper's Table 2).
 
     python -m experiments.real                    # about 15 minutes, collects 100 trajectories of the twin if needed
-    python -m experiments.real --preset paper     # 500 trajectories at 1640x1232, paper's schedule, estimates the time
+    python -m experiments.real --preset paper     # the paper's training schedule, 500 trajectories at 1640x1232
     python -m experiments.real --preset smoke     # a short run of every stage, for tests
     python -m experiments.real --plan             # prints the expected seconds of each stage
 
@@ -14,8 +14,9 @@
 
 The default sub-command is `train`. This sub-command trains three models on the trajectories in `WORKDIR/dataset`. The
 models are called "VAE visual", "VAE tactile" and "MVAE without pose". The models learn to predict the images of the
-object at rest from the images of the held object. Results go to `WORKDIR/table2`. A work directory cannot contain
-trajectories of both a device and the twin, so give the twin a separate `--workdir`.
+object at rest from the images of the held object. Results go to `WORKDIR/table2`. With `--preset paper`, the
+sub-command prints the expected seconds of each stage before the first stage, unless there are results already. A work
+directory cannot contain trajectories of both a device and the twin, so give the twin a separate `--workdir`.
 
 `--sensor` is the sensor file of `experiments.commission`. The sensor file contains the lens and images of the empty
 pad. Training needs the lens and these images.

@@ -1,7 +1,7 @@
 """Predict the images and the pose at rest of an object that a hand releases, from a frame that shows the held object.
 
     python -m experiments.released                    # 26 minutes on one CPU core of a busy computer
-    python -m experiments.released --preset long      # has not been run to the end yet, resumes after an interruption
+    python -m experiments.released --preset long      # unknown duration, can be stopped and started again
     python -m experiments.released --model paper      # the paper's four models instead of the state-space model
     python -m experiments.released --preset smoke     # a few minutes, for tests
     python -m experiments.released --preset paper     # the paper's data size and training schedule: hours, a GPU helps
@@ -11,7 +11,7 @@ The objects are small cameras (object class `camera`). This experiment is the si
 dataset. Results go to `runs/released/`: config.json, dataset/, models/NAME/, metrics.json, table.md and figures/*.png.
 A second run with the same `--workdir` resumes after an interruption, and leaves finished results unchanged.
 `--only train` runs one stage. Every field of the configuration is an option too, such as
-`--collection.num-objects 1000`, see `--help`.
+`--collection.num-objects 1000`, see `--help`. The authors have not yet run the preset `long` to the end.
 """
 
 import dataclasses

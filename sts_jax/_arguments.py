@@ -78,7 +78,7 @@ def checked_masks(
     """
     if not isinstance(present, Mapping | None):
         raise ValueError(
-            f"present is a {type(present).__name__}, but it must be a dict of bool arrays, such as "
+            f"present has the type {type(present).__name__}, but it must be a dict of bool arrays, such as "
             "present={'tactile': mask}."
         )
     masks = {}
@@ -91,7 +91,9 @@ def checked_masks(
             )
         if mask.shape != lead:
             raise ValueError(
-                f"present[{name!r}] has shape {mask.shape}, but it must have shape {lead}, the leading axes of {name}."
+                f"present[{name!r}] has shape {mask.shape}, but it must have shape {lead}, because {name} has shape "
+                f"{arrays[name].shape}: give one Boolean value for each item in the batch, or a single Boolean value "
+                "if there is no batch."
             )
         if mask.dtype != bool:
             raise ValueError(
@@ -113,7 +115,7 @@ def checked_measurements(measurements: Any, reserved: tuple[str, ...]) -> dict[s
     """
     if not isinstance(measurements, Mapping | None):
         raise ValueError(
-            f"measurements is a {type(measurements).__name__}, but it must be a dict of arrays, such as "
+            f"measurements has the type {type(measurements).__name__}, but it must be a dict of arrays, such as "
             "measurements={'wrench': wrench}."
         )
     own = {name: value for name, value in (measurements or {}).items() if value is not None}
@@ -201,8 +203,8 @@ def check_values(name: str, kind: Kind, array: np.ndarray) -> None:
         lengths = np.linalg.norm(array[..., 3:].astype(np.float64), axis=-1)  # squares of 1e30 are beyond float32
         if lengths.size and np.abs(lengths - 1).max() > _QUAT_TOLERANCE:
             raise ValueError(
-                f"pose has a quaternion of length {lengths.flat[np.abs(lengths - 1).argmax()]:.3g}, but the length "
-                "must be 1: give a position (m) and a unit quaternion [w, x, y, z]."
+                f"pose has a quaternion of length {lengths.flat[np.abs(lengths - 1).argmax()]:.5g}, but the length "
+                f"must be 1 (tolerance {_QUAT_TOLERANCE}): give a position (m) and a unit quaternion [w, x, y, z]."
             )
         if array.size and np.abs(array[..., :3]).max() > _FARTHEST:
             raise ValueError(

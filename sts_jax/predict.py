@@ -296,9 +296,10 @@ class Predictor:
 
     @property
     def modalities(self) -> tuple[str, ...]:
-        """Names of the inputs that the model accepts: any of "visual", "tactile", "pose" and further ones.
+        """Names of the inputs that the model accepts, such as "visual", "tactile" and "pose".
 
-        The model accepts an input only if the first frame of at least one training trajectory contains this input.
+        The names can include further modalities, each defined by a `dataset.Measurement`. The model accepts an input
+        only if the first frame of at least one training trajectory contains this input.
         """
         return tuple(name for name in self._inputs if name not in self.preprocessing.absent)
 

@@ -310,8 +310,8 @@ def _row_conditions(name: str, fields: dict[str, Any]) -> Iterator[_Condition]:
     rows, colors = _array(fields[place]), _array(fields["colors"])
     if len(rows) != len(colors):
         raise ValueError(
-            f"field {name}.{place} has {len(rows)} rows and field {name}.colors has {len(colors)} rows, but both must "
-            "have one row for each light: give them the same number of rows."
+            f"field {name}.{place} has the shape {rows.shape} and field {name}.colors has the shape {colors.shape}, "
+            "but both must have one row for each light: give them the same number of rows."
         )
     if place == "directions":
         yield (

@@ -34,7 +34,7 @@ def test_views_after_frames_are_read_in_the_given_order(tmp_path):
     records.write_images(path, [images, (views,)])
     back = records.read_views(path, np.array([7, 5]), resolution=(9, 7), total=8)
     np.testing.assert_array_equal(back, views[[2, 0]])
-    with pytest.raises(storage.DamagedFileError, match=r"has 8 records instead of 5"):
+    with pytest.raises(storage.DamagedFileError, match=r"number of records is 8 instead of 5"):
         records.read_images(path, np.arange(5), resolution=(9, 7), total=5)
 
 

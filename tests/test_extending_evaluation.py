@@ -117,7 +117,7 @@ def test_a_metric_needs_a_name_of_its_own_and_one_number_per_item(items):
     with pytest.raises(ValueError, match="metrics has more than one metric named 'position': give each metric its own"):
         evaluation.summarise({}, test, metrics=(*evaluation.METRICS, dataclasses.replace(HEIGHT, name="position")))
     wrong = dataclasses.replace(HEIGHT, errors=lambda predicted, test: predicted.pose)
-    with pytest.raises(ValueError, match=r"'height_error': its function `errors` .* \(6, 7\), but .* \(6,\): reduce"):
+    with pytest.raises(ValueError, match=r"'height_error': its function `errors` .* \(6, 7\), but .* \(6,\): keep"):
         evaluation.scorer(physics.Freefall(), train, metrics=(wrong,))(predicted, test)
 
 

@@ -203,7 +203,7 @@ def test_an_invalid_traced_measurement_gives_nan_in_its_item_alone(predictor):
         ({"load": np.zeros(1, np.int32)}, r"load is int32, but it must be floating-point\.$"),
         ({"sound": np.zeros(1, np.float32)}, "does not accept sound: the model was trained on load"),
         ({"pose": np.zeros(7, np.float32)}, "measurements must not have the key 'pose': pass these values as"),
-        ([1.0], "measurements is a list, but it must be a dict"),
+        ([1.0], "measurements has the type list, but it must be a dict"),
         ({}, "nothing to predict from: give at least one of load"),
     ],
 )

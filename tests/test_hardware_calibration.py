@@ -322,7 +322,7 @@ def test_a_tilted_or_turned_board_on_the_pad_is_refused(images, rays, printed):
 def test_wrong_arguments_raise_errors(images):
     with pytest.raises(ValueError, match="the same size, got the sizes 320x240, 640x480"):
         calibrate([*images, images[0][::2, ::2]], BOARD)
-    with pytest.raises(ValueError, match="on_pad must be the index of an image, 0 to 10, got 11"):
+    with pytest.raises(ValueError, match=r"on_pad must be the index of an image, .* got 11 .*images: 11"):
         calibrate(images, BOARD, on_pad=11)
     other = dataclasses.replace(BOARD, dictionary="DICT_5X5_50")
     with pytest.raises(CalibrationError, match="image 0 must show at least 12 corners of the board, but it shows 0"):

@@ -80,9 +80,9 @@ def test_models_of_other_categories_and_defective_rows_are_skipped_with_a_reason
         ("i", "has no unit"),
         ("j", "unit is 'inch'"),
         ("k", "must not be parallel"),
-        ("l", "in the column up, but"),
+        ("l", "in the column 'up', but"),
         ("m", "models-OBJ/models/m.obj does not exist"),
-        ("d", "several rows"),
+        ("d", "an earlier row"),
         ("o", "_BAD"),
         ("metadata.csv", "2 of 15 models are of none"),
     ):

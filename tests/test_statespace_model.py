@@ -486,7 +486,7 @@ def test_rigid_finds_the_nearest_rotation():
         ({"encoder": (4, 4)}, "encoder has 2 widths and decoder has 3, but each must have 3"),
         ({"condition": 1}, r"condition is 1 and vectors is 1, but they must satisfy condition >= 2 \* vectors >= 0"),
         ({"drawn_first": 0.0}, r"drawn_first is 0\.0"),
-        ({"outcome_names": ("rests",)}, r"outcome_names has 1 names \('rests',\), but outcomes is"),
+        ({"outcome_names": ("rests",)}, r"outcome_names is \('rests',\), but outcomes, the number of outcomes, is"),
     ],
 )
 def test_config_rejects_values_out_of_range(change, message):

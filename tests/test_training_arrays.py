@@ -72,7 +72,7 @@ def test_image_arrays_are_first_inputs_and_last_targets_and_mask_first_touches_w
 
 def test_image_arrays_refuse_poses_and_other_shapes():
     images, blank = np.zeros((3, 2, 64, 64, 3), np.uint8), np.zeros((64, 64, 3), np.uint8)
-    with pytest.raises(ValueError, match="modalities must have one or both of 'visual' and 'tactile'"):
+    with pytest.raises(ValueError, match="modalities must contain at least one of the names 'visual' and"):
         training.image_arrays(images, images, ("visual", "pose"), training.Preprocessing(), blank)
     with pytest.raises(ValueError, match="visual is uint8 of shape"):
         training.image_arrays(images, images, ("visual",), training.Preprocessing((32, 32)), blank)

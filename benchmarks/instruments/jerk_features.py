@@ -32,7 +32,7 @@ class Sight(NamedTuple):
 
 
 def look(body: objects.Body) -> tuple[np.ndarray, float, np.ndarray]:
-    """Compute the properties of one object that `Sight` contains for several objects.
+    """Compute the properties of one object. `Sight` contains the same properties of several objects.
 
     Returns:
         Profile (radii and height), height of the lowest point in the mesh frame, and mass properties for each value of

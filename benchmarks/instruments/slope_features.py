@@ -131,10 +131,11 @@ def pressed(starts: Starts) -> np.ndarray:
 def laid(scenario: physics.Inclined, items: list[objects.Body], starts: Starts, touch: np.ndarray | None) -> np.ndarray:
     """Compute features from which a classifier predicts the outcomes of trajectories on the slope.
 
-    The objects may have any shape. The features include the probabilities of tipping, sliding and sticking. A
-    probability is the weighted share of the predictions of `balance` for `DRAWS` random draws of the hidden contents,
-    each combined with `FRICTIONS` coefficients of friction. From vision alone, all predictions have equal weights. With
-    touch, the weight of a prediction is the likelihood of the measured centre of pressure.
+    The objects may have any shape. The features include the probabilities of tipping, sliding and sticking. For this
+    purpose, each of `DRAWS` random draws of the hidden contents is combined with each of `FRICTIONS` coefficients of
+    friction, and `balance` predicts the motion for each combination. The probability of a motion is the weighted share
+    of the combinations for which it is predicted. From vision alone, all combinations have equal weights. With touch,
+    the weight of a combination is the likelihood of the measured centre of pressure.
 
     Noise with the standard deviations `SEEN` is added to the pose in the first frame. Some objects have slipped by some
     micrometres before this frame, and an exact pose would reveal the slip to the classifier.

@@ -67,7 +67,9 @@ class TwinPeer:
         self.twin.close()
 
     def shown(self) -> dict[int, Shown]:
-        """Return the number of each frame in the twin's log, and the mean light during its exposure.
+        """Read the frame numbers and the brightness of the LEDs from the twin's log.
+
+        Frames are numbered from 0. The brightness is averaged over the exposure time of the frame.
 
         Returns:
             A dictionary with one entry per frame. The key is the checksum of the image (from the function `key`).

@@ -183,7 +183,8 @@ def live(config: Config, sensor: hardware.STS, pinhole: hardware.Pinhole) -> har
             image does not contain the whole view. The view is the part of the gel's outer face that rectified images
             show. The message explains how to replace or add pictures.
         ValueError: A picture of an earlier run has another size or cannot be read. The error is also raised if
-            `config.every` is None, so that each picture waits for the Enter key, and there is no keyboard.
+            `config.every` is None and there is no keyboard, because the Enter key must then be pressed before each
+            picture.
     """
     folder, size = config.out / "board", (config.width, config.height)
     pictures = boards.Pictures.read(folder, config.board, size)

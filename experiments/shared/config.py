@@ -167,8 +167,8 @@ def check(config: Config) -> None:
         listed, nearest = ", ".join(map(str, allowed)), min(allowed, key=lambda size: abs(size - config.image_size))
         raise ValueError(
             f"image_size must be one of {listed} for collection.resolution {height} {width} and model "
-            f"{config.model!r}, got {config.image_size}: give --image-size {nearest}, or choose another resolution, "
-            "and an image size that divides the resolution"
+            f"{config.model!r}, got {config.image_size}: give --image-size {nearest}, or give both another "
+            "--collection.resolution and an --image-size that divides this other resolution"
         )
     if config.model == "paper" and config.steps is not None and len(config.steps) != len(names):
         raise ValueError(
@@ -249,9 +249,11 @@ def _fits(model: Literal["statespace", "paper"], side: int, size: int) -> bool:
 
 
 def model_folder(workdir: Path, name: str, config: Config, split: str) -> Path:
-    """The folder of a model that was trained on one split of the data, "object" or "trajectory".
+    """The folder of a model that was trained on data split by object or by trajectory.
 
-    The folder is `models/NAME` for the first split in `config.splits`, and `models/NAME-by-SPLIT` for the other split.
+    The argument `split` is "object" if whole objects are held out from the training, and "trajectory" if random
+    trajectories are held out. The folder is `models/NAME` if `split` is the first entry of `config.splits`, and
+    `models/NAME-by-SPLIT` otherwise.
     """
     return workdir / "models" / (name if split == config.splits[0] else f"{name}-by-{split}")
 

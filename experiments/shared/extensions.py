@@ -48,8 +48,9 @@ class Extensions:
             for metric in column.metrics:
                 if metric.name not in names:
                     raise ValueError(
-                        f"the column {column.heading!r} has the metric {metric.name!r}, but metrics has only "
-                        f"{', '.join(map(repr, names))}: add the metric to metrics, or leave out the column"
+                        f"the column {column.heading!r} has the metric {metric.name!r}, which is not among the metrics "
+                        f"of these Extensions ({', '.join(map(repr, names)) or 'none'}): add the metric to the field "
+                        "`metrics`, or leave out the column"
                     )
 
     @property

@@ -62,8 +62,9 @@ def evaluate(
         The main table in Markdown.
 
     Raises:
-        ValueError: The names of `own.measurements` differ from those with which the model of the main table was
-            trained. A measurement is a modality besides images and pose, such as the contact force.
+        ValueError: The names of `own.measurements` differ from the names of the measurements with which the main model
+            was trained. The main model is the only trained model in the main table. A measurement is a modality besides
+            images and pose, such as the contact force.
     """
     suffix = "" if split == config.splits[0] else f"-by-{split}"
     done, figures = workdir / f"metrics{suffix}.json", workdir / f"figures{suffix}"

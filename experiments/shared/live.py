@@ -71,7 +71,14 @@ class Views:
     backgrounds: Backgrounds | None  # images of the empty pad, if they are known
 
     def shown(self, image: Image) -> Image:
-        """Rectify and crop a raw image to the sensor's pad, for display, uint8 RGB of shape (SIDE, SIDE, 3)."""
+        """Rectify a raw image for display, and crop it to the sensor's pad.
+
+        Args:
+            image: Raw image, uint8 RGB.
+
+        Returns:
+            Rectified image, uint8 RGB of shape (SIDE, SIDE, 3).
+        """
         return hardware.rectified(self.lens, self.pinhole, image, (SIDE, SIDE))
 
     def floats(self, image: Image, resolution: tuple[int, int]) -> Float[np.ndarray, "height width 3"]:

@@ -64,10 +64,10 @@ def lines(seen: Seen) -> list[str]:
 
 
 class PanelFile:
-    """A video or a picture of the live display over time, which consists of panels.
+    """A file that shows the live display at several times, as a video or as a picture.
 
-    A panel is an image of the display at one time (function `panel`). A video has 10 panels per second. A picture has
-    up to six panels, one below the other.
+    An image of the display at one time is called a panel (function `panel`). A video has 10 panels per second. A
+    picture has up to six panels, one below the other.
     """
 
     def __init__(self, path: Path):

@@ -93,7 +93,7 @@ def reroll(
     judge: Judge,
     progress: Callable[[int], object] | None = None,
 ) -> Ceilings:
-    """Re-roll trajectories, and score the mean of the re-rolls and a single re-roll as predictions.
+    """Re-roll trajectories, and score two predictions of each: the mean of its re-rolls, and one of its re-rolls.
 
     A re-roll is a new simulation from the first pose of a trajectory, with newly drawn hidden properties such as
     friction.

@@ -132,8 +132,8 @@ def _make_shard(
     left_out += failed
     if trajectory is None:
         raise ValueError(
-            f"{folder}: none of the objects {members[0]} to {members[-1]} (shard {index}) can be simulated: use other "
-            f'objects or another scenario. One of the errors is "{left_out[-1]}"'
+            f"{folder}: no object of shard {index} can be simulated (first object: {members[0]}, number of objects: "
+            f'{len(members)}): use other objects or another scenario. One of the errors is "{left_out[-1]}"'
         )
     members, bodies = np.array(list(found)), list(found.values())
     frames = _frames_of(collection, members, trajectory)

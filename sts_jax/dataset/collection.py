@@ -59,7 +59,7 @@ class Collection:
         return math.ceil(self.num_objects / self.objects_per_shard)
 
     def check(self, sensor: Sensor) -> None:
-        """Raise an error if a field of the collection or of its scenario is invalid, or if the sensor does not suit.
+        """Raise an error if a field of the collection or its scenario is invalid, or if the pad has the wrong shape.
 
         Args:
             sensor: The sensor. Its pad must be square if `symmetries=True` and the scenario allows quarter turns.

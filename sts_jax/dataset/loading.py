@@ -218,8 +218,8 @@ class Dataset:
 
         Args:
             part: Name of the part: `train`, `validation` or `test`.
-            rendered: True to return only the trajectories that have images, as `pairs` requires. False to return all
-                trajectories. `ends` accepts all of them.
+            rendered: True returns only the trajectories that have images, as the method `pairs` requires. False also
+                returns the trajectories without images, which the method `ends` accepts.
 
         Raises:
             ValueError: `part` is not `train`, `validation` or `test`.
@@ -323,7 +323,8 @@ class Dataset:
         if without.size:
             raise ValueError(
                 f"`trajectories` contains {without[0]}, which has no images "
-                f"(num_rendered={self.collection['num_rendered']} is the number of trajectories with images per object)"
+                f"(num_rendered={self.collection['num_rendered']} is the number of each object's trajectories that "
+                "have images)"
                 ": use `ends`, which needs no images, or take indices from `members` or `rendered`."
             )
         last = self.trajectory["pose"].shape[1] - 1

@@ -252,7 +252,9 @@ def _read_records(path: Path, indices: np.ndarray, total: int) -> np.ndarray:
     except (RuntimeError, ValueError, IndexError) as error:
         raise DamagedFileError(f"{path} is damaged ({error}): {again}.") from error
     if count != total:
-        raise DamagedFileError(f"{path} is damaged, because it has {count} records instead of {total}: {again}.")
+        raise DamagedFileError(
+            f"{path} is damaged, because its number of records is {count} instead of {total}: {again}."
+        )
     return np.frombuffer(b"".join(records), np.uint8).reshape(len(records), -1)
 
 

@@ -202,8 +202,8 @@ def predict(
         lacking = set(names) - set(NAMES) - set(test.measurements if pairs is None else pairs.measurements)
         if lacking:
             raise ValueError(
-                f"`{name}.measurements` lacks {', '.join(map(repr, sorted(lacking)))}: pass measurements=... to "
-                "Dataset.pairs for all parts of the dataset"
+                f"`inputs` contains {', '.join(map(repr, sorted(lacking)))}, but `{name}.measurements` does not: make "
+                f"`{name}` with Dataset.pairs(..., measurements=...)"
             )
 
     def run(pairs: Pairs, num_samples: int) -> Predicted:

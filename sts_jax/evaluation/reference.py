@@ -1,7 +1,7 @@
 """The baselines, which predict the last frame without a trained model.
 
-The module also contains the names of the predictors that need no trained model: the baselines, and the two predictions
-from repeated simulation (`evaluation.ceiling`).
+The module also defines the names of the baselines, and the names of two further predictors, which simulate each
+trajectory again. One predicts the mean of many simulations (`evaluation.ceiling`), the other the result of one.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Errors of predictions of the last frames of held-out trajectories, which are called items."""
+"""Errors of the predicted last frames of held-out trajectories. Each held-out trajectory is called an item."""
 
 import enum
 import functools
@@ -145,7 +145,7 @@ def _further(predicted: Predicted, test: Pairs, metrics: Sequence[Metric]) -> di
             raise ValueError(
                 f"metric {metric.name!r}: its function `errors` returned an array of shape "
                 f"{found[metric.name].shape}, but the array must have one number per item and the shape "
-                f"{(len(test.object),)}: reduce the other axes, for instance by a mean"
+                f"{(len(test.object),)}: keep the axis of the items, and reduce all other axes, for instance by a mean"
             )
     return found or None
 

@@ -114,7 +114,9 @@ def fit_lens(
     """
     width, height = size
     if not 0 <= on_pad < max(1, len(found)):
-        raise ValueError(f"on_pad must be the index of an image, 0 to {max(len(found) - 1, 0)}, got {on_pad}")
+        raise ValueError(
+            f"on_pad must be the index of an image, counted from 0, got {on_pad} (number of images: {len(found)})"
+        )
     if len(found) < FEWEST_IMAGES:
         raise CalibrationError(
             f"a calibration needs at least {FEWEST_IMAGES} images of the board in different poses, got {len(found)}. "

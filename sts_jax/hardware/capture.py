@@ -155,7 +155,9 @@ def _open(config: CameraConfig) -> cv2.VideoCapture:
 
 
 def size_error(config: CameraConfig, width: int, height: int) -> FrameSizeError:
-    """Return the error for frames whose size is not the size that the configuration requests.
+    """Make the exception that reports that the camera's frames do not have the size in the configuration.
+
+    The caller compares the sizes before it calls this function.
 
     Args:
         config: Configuration of the camera.

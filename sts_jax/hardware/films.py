@@ -120,7 +120,7 @@ class RecordedFilm(Film):
             self._files[stream] = path.open("rb")
         except OSError as error:
             raise type(error)(
-                f"{path} cannot be read ({error}). According to {FRAMES}, this video contains {len(places)} images. "
+                f"{path} cannot be read ({error}). Number of images that {FRAMES} lists for this video: {len(places)}. "
                 "Check the video, or copy the recording again."
             ) from error
         size = path.stat().st_size

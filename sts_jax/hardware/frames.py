@@ -74,8 +74,9 @@ class Pace:
 
     After an interval of n + 1 periods between two frames, n frames count as lost. The attribute `dropped` is the number
     of all lost frames. If the next frames follow each other in less than one period, some or all of the n frames were
-    only late, not lost. `dropped` is then reduced by the number of late frames. The method `arrived` returns the number
-    of frames that seem to be lost at the time of its call. The sum of its results can therefore exceed `dropped`.
+    only late, not lost. `dropped` is then reduced by the number of late frames. Each call of the method `arrived`
+    records one frame, and returns the estimated number of frames that were lost just before it. Late frames are not
+    subtracted from these results, so the sum of the results can exceed `dropped`.
     """
 
     def __init__(self, nominal: float | None):

@@ -157,10 +157,11 @@ def observe(
 def empty_pad(observations: Sequence[Observation]) -> EmptyPad:
     """Measure the appearance of the empty pad, and its noise, from several observations.
 
-    An observation contains the mean colours of blocks of the images, see `observe`. The mean colour of a block varies
-    from observation to observation, and the standard deviation of this variation is the noise of the block. A few
-    observations can underestimate the noise. The returned noise of a block is therefore at least the median noise of
-    all blocks of the same size in the same stream.
+    An observation contains the mean colours of blocks of a visual and a tactile image. The tactile image is divided
+    twice, into blocks and into small blocks, see `observe`. The mean colour of a block varies from observation to
+    observation, and the standard deviation of this variation is the noise of the block. A few observations can
+    underestimate the noise. The returned noise of a block is therefore at least the median noise of all blocks of the
+    same size in the same image.
 
     Args:
         observations: At least two observations of the empty pad without movement.

@@ -166,10 +166,11 @@ class Recordings:
 
 
 def load_recordings(folder: str | os.PathLike) -> Recordings:
-    """Return the trajectories of a session that the user has confirmed (`Session.confirm`).
+    """Return the confirmed trajectories of a session.
 
-    A session is a folder of trajectories that were recorded with one sensor. The images of a trajectory are read when
-    the trajectory is accessed. This function does not lock the session, so another process may add trajectories to it.
+    A session is a folder of trajectories that were recorded with one sensor. The user confirms each good trajectory
+    with `Session.confirm` or `confirm_recording`. The images of a trajectory are read when the trajectory is accessed.
+    This function does not lock the session, so another process may add trajectories to it.
 
     Args:
         folder: Folder of the session, which contains `session.json`.

@@ -1,4 +1,4 @@
-"""`STS`: camera and lights as one sensor. The lights do not change during the exposure of an image that it returns."""
+"""`STS`: camera and lights as one sensor. The lights do not change during the exposure of a returned image."""
 
 import dataclasses
 import itertools
@@ -522,9 +522,10 @@ def first_still(shots: Iterable[Shot], timeout_s: float, window_s: float) -> Sho
         if shot.time_s - started_s > timeout_s:
             break
     raise NotStillError(
-        f"within {timeout_s:g} s, there was no period of {window_s:g} s without movement. The largest difference "
-        f"between the last image and an earlier image is {change:.0f} of 255, and up to {allowed:.0f} counts as still. "
-        "Keep the scene at rest, raise timeout_s, or check whether the light of the room changes."
+        f"within {timeout_s:g} s, there was no period of {window_s:g} s without movement. An image counts as still if "
+        f"no part of it differs from the first image of the period by more than {allowed:.2f} of 255. For the last "
+        f"image, the largest difference was {change:.2f}. Keep the scene at rest, raise timeout_s, or check whether "
+        "the light of the room changes."
     )
 
 

@@ -290,7 +290,7 @@ class MVAE(nnx.Module):
         Args:
             name: Name of the modality.
             z: Latents, `(batch, latent + condition)`. If the model has a condition (known quantities, such as an
-                acceleration), its numbers are appended to each latent.
+                acceleration), append the numbers of the condition to each latent before the call.
             weights: Weight of each sample in batch normalisation, `(batch,)`. With None, batch normalisation uses the
                 running statistics.
 

@@ -86,7 +86,9 @@ def library(
     if scale is not None and longest_side is not None:
         raise ValueError(f"{folder}: give scale or longest_side, not both")
     if scale is not None and not (scale > 0 and math.isfinite(scale)):
-        raise ValueError(f"{folder}: scale is {scale} m, but it must be positive and finite")
+        raise ValueError(
+            f"{folder}: scale is {scale}, but the length of one unit of the mesh files (m) must be positive and finite"
+        )
     for name, value in (("longest_side", longest_side), ("largest", largest)):
         if value is not None and not SMALLEST <= value <= PAD:
             raise ValueError(f"{folder}: {name} is {value} m, but it must be from {SMALLEST} to {PAD} m")
@@ -308,7 +310,7 @@ def _made(collection: Library, item: Item) -> Entry:
     thickness = float(np.ptp(vertices @ shape.equations[:, :3].T, axis=0).min())
     if thickness < THINNEST:
         raise ValueError(
-            f"{item.path}: the object is {thickness * 1e3:.2g} mm thick, but stable contacts need at least "
+            f"{item.path}: the object is {thickness * 1e3:.4g} mm thick, but stable contacts need at least "
             f"{THINNEST * 1e3:g} mm: thicken the mesh"
         )
     apart = gaps(body)

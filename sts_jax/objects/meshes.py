@@ -110,9 +110,9 @@ def load(
             is. The filled share of the interior is an argument of the function `rigid`. If False, the body has no
             contents.
         strict: If True, a mesh that is not closed or encloses no volume is an error, and so is a missing material or
-            image of an OBJ file. If False, these defects are repaired with a warning. The convex hull of a mesh
-            that is not closed or encloses no volume then bounds the contents. Missing materials and images are left
-            out.
+            image of an OBJ file. If False, these defects are repaired with a warning. If a mesh is not closed or
+            encloses no volume, the repair uses the convex hull of the mesh as the boundary of the contents. Missing
+            materials and images are left out.
         up: Axis of the file, or direction in the file, that becomes +z. The convention of glTF files is "y".
         front: Direction in the file that becomes -y. If `up` is an axis such as "z", `front` must be None. If
             `up` is a direction (a tuple), the default None means (0, -1, 0).

@@ -79,7 +79,8 @@ def items(root: Path) -> tuple[list[Item], list[tuple[str, str]]]:
         try:
             if name in seen:
                 raise ValueError(
-                    "the model has several rows in metadata.csv, of which only the first is used: remove the others"
+                    "this row of metadata.csv is skipped, because an earlier row describes the same model: remove this "
+                    "row or the earlier one"
                 )
             seen.add(name)
             if "_BAD" in categories:
@@ -152,7 +153,7 @@ def _vector(text: str, key: str) -> Vector | None:
         x, y, z = (float(part) for part in text.replace("\\", "").split(","))
     except ValueError as error:
         raise ValueError(
-            f"the row of the model in metadata.csv has {text!r} in the column {key}, but this cell must contain three "
-            "numbers"
+            f"the row of the model in metadata.csv has {text!r} in the column {key!r}, but this cell must contain "
+            "three numbers"
         ) from error
     return x, y, z

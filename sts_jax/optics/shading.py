@@ -199,7 +199,7 @@ def housing(
     The housing has a dark wall at each edge of the pad. Each wall is perpendicular to the gel's outer face and extends
     towards the camera. A camera ray that passes beside the pad ends at a wall. The brightness of a wall decreases with
     the distance t from the plane of the gel's outer face: `rim exp(-t / rim_depth)`. `rim` and `rim_depth` (m) are
-    constants of the room.
+    fields of the argument `room`.
 
     Args:
         room: Constants of the external light.
@@ -220,7 +220,7 @@ def housing(
 def empty_view(
     room: Room, square_radius: Float[Array, "*n"], walls: Float[Array, "*n"], hidden: Float[Array, "*n"]
 ) -> Float[Array, "*n 3"]:
-    """Render the visual image without the object: the pad with the object's shadow, and the housing's walls beside it.
+    """Render the pad and the housing's walls with the shadow of the object, but without the object itself.
 
     Args:
         room: Constants of the external light.
@@ -247,8 +247,8 @@ def shade(
 ) -> Float[Array, "*n 3"]:
     """Compute the colour of an object as seen through the skin.
 
-    The colour is computed in four steps. `ambient`, `crease`, `crease_height`, `haze`, `tint` and `milk` are constants
-    of the room.
+    The colour is computed in four steps. `ambient`, `crease`, `crease_height`, `haze`, `tint` and `milk` are fields of
+    the argument `room`.
 
     1. Light on the object by Lambert's law: `albedo * (ambient + sum_m max(0, L_m . N) c_m)`, with the normal N, and
        the unit direction L_m and colour c_m of each light m.

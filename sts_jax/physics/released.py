@@ -153,9 +153,9 @@ class Released(Scenario):
         - `RETURNS`, in all other cases.
 
         The limit of 45 degrees suits most poses from `start`. In these poses, the object stands on the edge between two
-        of its faces, and the angle a between the narrower face and the pad is less than 45 degrees. If the two faces
-        are perpendicular, the object turns by a if it returns to the narrower face, and by 90 degrees - a, which is
-        more than 45 degrees, if it topples onto the wider face.
+        of its faces, and the angle `a` between the narrower face and the pad is less than 45 degrees. Suppose that the
+        two faces are perpendicular. An object that returns to the narrower face turns by the angle `a`. An object that
+        topples onto the wider face turns by `90 degrees - a`, which is more than 45 degrees.
         """
         before, after = (geometry.quat_to_matrix(geometry.normalize(pose[3:]))[2] for pose in (first, last))
         stays = jnp.where(before @ after < math.cos(TURNED), Outcome.TOPPLES, Outcome.RETURNS)

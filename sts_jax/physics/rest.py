@@ -130,9 +130,9 @@ def place(
     """Place a body at rest on the level pad, on one of its stable faces and under its own weight.
 
     The simulation treats the pad as almost rigid: an object at rest penetrates it by 0.01 mm. The body is placed at
-    this depth, so it stays at rest in a simulation from this pose. It sinks deeper into the soft gel of the sensor.
-    `sense` computes this larger depth from the wrench that this function returns. The function runs on the host and
-    cannot be called under `jit`, `vmap` or `grad`.
+    this depth, so it stays at rest in a simulation from this pose. In contrast, `sense` treats the pad as a soft gel,
+    into which the body sinks deeper. `sense` computes this larger depth from the wrench that this function returns. The
+    function runs on the host and cannot be called under `jit`, `vmap` or `grad`.
 
     Args:
         body: One body.

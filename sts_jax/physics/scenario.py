@@ -1,4 +1,4 @@
-"""The interface of scenarios: starts of objects, the gravity that acts on them, and the outcomes of trajectories."""
+"""The interface of scenarios: initial poses of objects, gravity that acts on them, and outcomes of trajectories."""
 
 import abc
 import dataclasses
@@ -370,8 +370,9 @@ def variant(scenario: _AnyScenario, name: str) -> _AnyScenario:
         scenario: Scenario to copy. Its other fields stay the same.
         name: Name of the variant. "default" changes nothing. "off" fixes each hidden property at the middle of its
             range, and the contents of an object lie at its base. "wide-friction" draws friction from 0.3 to 0.9.
-            "off-centre" lets the contents settle while the object has any orientation (`tilt` is pi), so the contents
-            can lie at any side of the object, as in `Inclined()`.
+            "off-centre" sets `tilt` to pi. This field is the largest angle between the object's +z and the upward
+            direction while the contents settle. With pi, the object can have any orientation, so the contents can lie
+            at any side of the object, as in `Inclined()`.
 
     Returns:
         A scenario of the same class.

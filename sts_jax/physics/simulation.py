@@ -83,7 +83,8 @@ def simulate(
         start: Starts that replace the random ones, ordered body by body. If all bodies together have n trajectories,
             `pose` has the shape (n, 7) and `condition` has the shape (n, c). `held` (number of time steps before the
             release) and `carried` (share of the weight that the pad carries before the release) have the shape (n,) or
-            are one number for all trajectories. With `held=scenario.steps`, an object is released at frame 0.
+            are one number for all trajectories. The simulation begins one frame interval (`scenario.steps` time steps)
+            before frame 0, so `held=scenario.steps` releases an object at frame 0.
         hidden: Hidden properties (friction, mass of the shell, and contents) that replace the random ones, ordered body
             by body. If all bodies together have n trajectories, the field `up` has the shape (n, 3), and the other
             fields have the shape (n,). A trajectory has the same start with and without `hidden` if it has the same

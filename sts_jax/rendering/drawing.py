@@ -65,8 +65,9 @@ def draw(
 ) -> Images:
     """Draw the images of an object whose pose on the gel is known.
 
-    `sense` runs two compiled programs. The first program (`rendering.equilibrium`) computes `resting`. This function is
-    the second program. The other arguments are those of `sense`.
+    `sense` runs two compiled programs. The first program (`rendering.equilibrium`) computes the object's pose on the
+    gel and the pressure of the gel. This function is the second program. Its argument `resting` is the result of the
+    first program. Its other arguments are those of `sense`.
     """
     drawn = functools.partial(_draw, resolution=resolution, crop=crop, moving_edges=moving_edges)
     return looped(drawn)(sensor, body, resting)

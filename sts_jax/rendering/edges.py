@@ -41,8 +41,8 @@ def with_moving_edges(
             of each pixel.
         depth: Depth of the object from the pinhole (m), `inf` where there is no object.
         on_pad: True for pixels whose rays pass through the pad.
-        follows: True for pixels in which the imprint follows the surface of the object. False for flat skin, and where
-            the imprint is clipped to the thickness of the gel.
+        follows: True for pixels in which the imprint follows the surface of the object. False where the object does not
+            press into the gel, and where the imprint is clipped to the thickness of the gel.
 
     Returns:
         The imprint.

@@ -7,10 +7,10 @@ necessary correction depends on the inputs.
 
 Three numbers for each subset of the inputs correct the density: an exponent of the probabilities of the outcomes, an
 exponent of the weights of the mixtures, and a factor of the variances. They are temperatures in the sense of Guo et al.
-(2017), "On Calibration of Modern Neural Networks". The first number can make the outcomes less or more certain, because
-the predicted probabilities are often too uncertain after a short training. The other two numbers can only widen the
-density of the pose. In a fit to few objects, a narrower density often has the largest likelihood, but it covers too few
-of the true poses of other objects.
+(2017), "On Calibration of Modern Neural Networks". The first number can make the probabilities of the outcomes less
+certain or more certain. After a short training, these probabilities are often too uncertain, and the number makes them
+more certain. The other two numbers can only widen the density of the pose. In a fit to few objects, a narrower density
+often has the largest likelihood, but it covers too few of the true poses of other objects.
 
 A fourth number is the contrast of the sampled images. A larger contrast makes their outlines sharper. The gradient
 energy of an image is the sum of the squared differences of neighbouring pixels. The fit chooses the contrast at which

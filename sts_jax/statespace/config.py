@@ -86,8 +86,8 @@ class Config:
             )
         if self.outcome_names and len(self.outcome_names) != self.outcomes:
             raise ValueError(
-                f"outcome_names has {len(self.outcome_names)} names {self.outcome_names}, but outcomes is "
-                f"{self.outcomes}: give one name for each outcome, or none"
+                f"outcome_names is {self.outcome_names}, but outcomes, the number of outcomes, is {self.outcomes}: "
+                "give one name for each outcome, or an empty tuple"
             )
         for name in ("drawn", "drawn_first"):
             if not 0 < getattr(self, name) <= 1:

@@ -1,9 +1,10 @@
 """Functions on the unit sphere as sums of real spherical harmonics, and their rotation with an object.
 
-A function is given by its coefficients, one for each harmonic. The harmonics are in the order of their degrees 0, 1, 2,
-..., and within degree n in the order 0, 1, -1, ..., n, -n. A positive order belongs to a cosine and a negative order to
-a sine of the angle about the z axis. The harmonics are homogeneous polynomials of the direction d, and their mean
-square over the sphere is 1. A rotation matrix R turns the function f into the function d -> f(R^T d).
+A function is given by its coefficients, one for each harmonic. The harmonics are sorted by degree n = 0, 1, 2, ...,
+and within a degree by order m = 0, 1, -1, ..., n, -n. A harmonic of order m > 0 is proportional to the cosine of m
+times the angle about the z axis, and a harmonic of order m < 0 to the sine of -m times this angle. The harmonics are
+homogeneous polynomials of the direction d, and their mean square over the sphere is 1. A rotation matrix R turns the
+function f into the function d -> f(R^T d).
 """
 
 import math
@@ -29,8 +30,8 @@ def basis(direction: Float[Array, "*n 3"], degree: int) -> Float[Array, "*n k"]:
         degree: Largest degree.
 
     Returns:
-        Values of the k harmonics at each direction. They are sorted by degree, and within degree n by the orders 0, 1,
-        -1, ..., n, -n.
+        Values of the k harmonics at each direction. They are sorted by degree n = 0, 1, 2, ..., and within a degree by
+        order m = 0, 1, -1, ..., n, -n.
     """
     x, y, z = direction[..., 0], direction[..., 1], direction[..., 2]
     square = x**2 + y**2 + z**2
@@ -100,7 +101,7 @@ def turn_variance(angle: Float[Array, "n 2"], variance: Float[Array, "n c k"]) -
 
 
 def _orders(degree: int) -> list[tuple[int, int]]:
-    """Degree and order of each harmonic, in the order of the coefficients."""
+    """Degree n and order m of each harmonic, in the sequence of the coefficients."""
     return [(n, m) for n in range(degree + 1) for m in (0, *(s * a for a in range(1, n + 1) for s in (1, -1)))]
 
 

@@ -47,8 +47,9 @@ class Arrays:
             leaves = jax.tree_util.tree_leaves_with_path(self._tree())
             found = {jax.tree_util.keystr(path, simple=True, separator="/"): len(x) for path, x in leaves}
             raise ValueError(
-                f"the arrays have the numbers of samples {found}, but all arrays must have the same number of samples, "
-                "and at least one sample: give arrays of equal length"
+                "all arrays must have the same length, which is the number of samples and must be at least 1, but "
+                f"{f'the lengths are {found}' if found else 'there are no arrays'}: give arrays of equal length that "
+                "are not empty"
             )
 
     def __len__(self) -> int:

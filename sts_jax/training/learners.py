@@ -108,9 +108,9 @@ def _check_state(model: statespace.Config, arrays: Arrays) -> None:
     """Raise a ValueError if a training set does not fit a state-space model."""
     if arrays.target_present or not set(arrays.present) <= set(model.inputs):
         raise ValueError(
-            f"the training set of a state-space model may have masks only for the model's inputs {list(model.inputs)} "
-            f"in `present`, and no masks in `target_present`: remove all other masks. `present` has masks for "
-            f"{sorted(arrays.present)}. `target_present` has masks for {sorted(arrays.target_present)}"
+            f"`present` has masks for {sorted(arrays.present)}, and `target_present` has masks for "
+            f"{sorted(arrays.target_present)}. For a state-space model, `present` may have masks only for the model's "
+            f"inputs, which are {list(model.inputs)}, and `target_present` must be empty: remove all other masks"
         )
     size, small = (model.input_size,) * 2, (model.image_size,) * 2
     codes, images = {"state": (statespace.STATE_CODE,), "pose": (statespace.POSE_CODE,)}, statespace.IMAGES

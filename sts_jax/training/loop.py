@@ -222,8 +222,9 @@ def _run(
             if not np.isfinite(record["loss"]):
                 raise FloatingPointError(
                     f"{workdir}: the loss is {record['loss']} at step {done}: lower TrainConfig.learning_rate (now "
-                    f"{config.learning_rate}), or set a lower TrainConfig.clip (now {config.clip}). If you gave an "
-                    "optimiser, change that optimiser instead, because it does not use these two options"
+                    f"{config.learning_rate}), or {'set' if config.clip is None else 'lower'} TrainConfig.clip (now "
+                    f"{config.clip}). If you gave an optimiser, change that optimiser instead, because it does not use "
+                    "these two options"
                 )
         if done % config.checkpoint_every == 0 or done == total:
             save(workdir, state)

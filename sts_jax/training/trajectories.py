@@ -93,7 +93,10 @@ def image_arrays(
     """
     found, shape = {"visual": visual, "tactile": tactile}, (2, *preprocessing.resolution, 3)
     if not modalities or not set(modalities) <= set(found):
-        raise ValueError(f"modalities must have one or both of 'visual' and 'tactile', got {modalities}")
+        raise ValueError(
+            "modalities must contain at least one of the names 'visual' and 'tactile', and no other name, got "
+            f"{modalities}"
+        )
     for name, images in found.items():
         if images.dtype != np.uint8 or images.shape != (len(visual), *shape) or not len(images):
             raise ValueError(
@@ -154,8 +157,8 @@ def paper_model(
     for name in modalities:
         if name not in known:
             raise ValueError(
-                f"modalities contains {name!r}, but it may contain only {', '.join(map(repr, known))}: specify another "
-                "modality as a dataset.Measurement in the argument measurements"
+                f"modalities contains {name!r}, but it may contain only {', '.join(map(repr, known))}: remove "
+                f"{name!r} from modalities, and pass it as a dataset.Measurement in the argument measurements"
             )
     kept = [known[name] for name in modalities]
     kept += [

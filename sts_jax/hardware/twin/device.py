@@ -162,7 +162,7 @@ class Twin:
             )
 
     def run_on(self, clock: Callable[[], float]) -> None:
-        """Replace the virtual clock by another one, and reset the LED controller, the lights and the camera.
+        """Replace the virtual clock by the given clock, and reset the LED controller, the lights and the camera.
 
         Args:
             clock: Function that returns the time of the new clock (s), such as `time.monotonic`.

@@ -19,8 +19,8 @@ class Hand(AutomaticPerson):
     pose of the next trajectory. The trajectory without contact is not recorded, and its number stays unused in the
     session.
 
-    The session gives each trajectory a number, and the scene of the twin gives it a second number. The two
-    numbers are equal if the first number of the scene is the number of the session's next trajectory:
+    The session numbers the trajectories, and the scene of the twin numbers them independently. A trajectory has the
+    same number in both if the scene starts to count at the number of the session's next trajectory:
     `ObjectScene(first=hardware.next_recording(folder))`.
     """
 

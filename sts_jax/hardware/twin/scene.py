@@ -139,7 +139,7 @@ class Picture(Scene):
         return Seen(Phase.STILL, 0, 0, None)
 
     def ends(self, seen: Seen, blender: Blender) -> Ends:
-        """Return the two images that were passed to `Picture`, in linear light and distorted by the lens.
+        """Convert the two images of the `Picture` to linear light, and apply the lens distortion and the vignetting.
 
         See `Scene.ends` for the arguments. The argument `seen`, the state of the scene, has no effect on the images.
         """

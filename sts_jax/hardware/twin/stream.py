@@ -66,8 +66,8 @@ class CameraThread:
 
         Returns:
             The newest frame after `index` whose delivery time `due_s` has been reached. If the delivery times of all
-            frames after `index` are in the future, the result is the first of these frames, and the caller waits until
-            the delivery time. If no frame after `index` exists, the result is None.
+            frames after `index` are in the future, the result is the first of these frames. The caller must then wait
+            until the delivery time before it sends the frame. If no frame after `index` exists, the result is None.
         """
         with self._changed:
             later = [made for made in self._made if made.exposure.index > index]
