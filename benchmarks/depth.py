@@ -185,7 +185,7 @@ def measure(
         first_seed: Offset of the seeds of the random poses.
 
     Returns:
-        The differences by name of the object. `total` combines the differences of all images of an object.
+        The differences by name of the object. The function `total` has combined those of all images of the object.
     """
     sensor = sts.Sensor()
     sense = jax.jit(lambda *inputs: sts.sense(sensor, *inputs, resolution=shape))

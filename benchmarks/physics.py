@@ -345,12 +345,11 @@ def first_call(name: str, count: int) -> dict[str, Any]:
 
     Args:
         name: Name of the scenario, in SCENARIOS.
-        count: Number of objects. Compilations are counted for the objects that the scenario accepts.
+        count: Number of objects that are made. Objects that cannot be simulated in the scenario are not used.
 
     Returns:
         A dict. `seconds`: duration of the first call minus duration of the second call (s). `objects`: number of
-        objects that the scenario accepts. `programs`: number of compilations of each compiled function of `simulate`
-        for these objects.
+        used objects. `programs`: number of compilations of each compiled function of `simulate` for these objects.
     """
     scenario, sensor, items = SCENARIOS[name], Sensor(), bodies(objects.CATEGORIES, count)
     items = [body for body in items if physics.refusal(body, scenario) is None]

@@ -55,7 +55,7 @@ def sight(items: list[objects.Body]) -> Sight:
 
 
 def weighed(starts: Starts) -> np.ndarray:
-    """Exact value of the quantity that the sense of touch measures: the logarithm of the mass in kg, `(n, 1)`."""
+    """True logarithm of the mass in kg, `(n, 1)`, which the tactile image of a standing object shows approximately."""
     return np.log(starts.mass)[:, None]
 
 

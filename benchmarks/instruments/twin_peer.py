@@ -1,6 +1,7 @@
 """A digital twin that replaces a real sensor in a benchmark.
 
-The twin logs the light of each frame, so a benchmark can check the light of an image independently of `hardware.STS`.
+The twin logs the brightness of its LEDs during each frame. A benchmark can therefore check whether the LEDs were on or
+off in an image, independently of `hardware.STS`.
 """
 
 import math

@@ -87,7 +87,7 @@ def library(
         raise ValueError(f"{folder}: give scale or longest_side, not both")
     if scale is not None and not (scale > 0 and math.isfinite(scale)):
         raise ValueError(
-            f"{folder}: scale is {scale}, but the length of one unit of the mesh files (m) must be positive and finite"
+            f"{folder}: scale, the length of one unit of the mesh files (m), must be positive and finite, got {scale}"
         )
     for name, value in (("longest_side", longest_side), ("largest", largest)):
         if value is not None and not SMALLEST <= value <= PAD:

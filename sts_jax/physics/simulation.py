@@ -81,9 +81,10 @@ def simulate(
         scenario: `Freefall()`, `Inclined()`, `Perturbed()`, `Released()` or another `Scenario`.
         num: Number of trajectories of each body.
         start: Starts that replace the random ones, ordered body by body. If all bodies together have n trajectories,
-            `pose` has the shape (n, 7) and `condition` has the shape (n, c). `held` (number of time steps before the
-            release) and `carried` (share of the weight that the pad carries before the release) have the shape (n,) or
-            are one number for all trajectories. The simulation begins one frame interval (`scenario.steps` time steps)
+            `pose` has the shape (n, 7) and `condition` (the c numbers of the scenario's known quantities, such as an
+            acceleration of the pad) has the shape (n, c). `held` (number of time steps before the release) and
+            `carried` (share of the weight that the pad carries before the release) have the shape (n,) or are one
+            number for all trajectories. The simulation begins one frame interval (`scenario.steps` time steps)
             before frame 0, so `held=scenario.steps` releases an object at frame 0.
         hidden: Hidden properties (friction, mass of the shell, and contents) that replace the random ones, ordered body
             by body. If all bodies together have n trajectories, the field `up` has the shape (n, 3), and the other

@@ -24,7 +24,7 @@ from sts_jax.sensor import Sensor
 
 
 class Images(NamedTuple):
-    """Visual, tactile and depth image of one frame, the mask of the object, and the part of the gel in the images."""
+    """Visual, tactile and depth image of one frame, the mask of the object, and the part of the gel that they show."""
 
     visual: Float[Array, "h w 3"]  # view through the skin, sRGB in [0, 1]
     tactile: Float[Array, "h w 3"]  # image of the lit skin in [0, 1]

@@ -90,11 +90,11 @@ def sample(
 
 
 class Drawn(NamedTuple):
-    """Samples without complete images: k final poses for each of n items, and layers for some of these poses.
+    """Samples: k final poses for each of n items, and the parts of the final images that the object changes.
 
-    Each item has k poses, but only the poses with index 0 to `drawn` - 1 have layers. `drawn` is an argument of `draw`.
-    The layers are the outlines and colours of the objects, and the changes that the objects cause in the tactile
-    images. `compose` combines them with the images of the empty sensor, and returns complete images.
+    These parts are called layers. They are the outlines and colours of the objects, and the changes that the objects
+    cause in the tactile images. `compose` combines them with the images of the empty sensor, and returns complete
+    images. Only the poses with index 0 to `drawn` - 1 have layers. `drawn` is an argument of `draw`.
     """
 
     belief: Gaussian  # posterior of the state code and the appearance code of the first frame, (n, code + look)

@@ -239,6 +239,7 @@ def preprocessing_from_json(content: dict) -> Preprocessing:
         return storage.decode(Preprocessing, content, "preprocessing")
     except (TypeError, ValueError) as error:  # TypeError: a value that JSON does not have
         raise ValueError(
-            f"{content!r} does not describe a preprocessing ({type(error).__name__}: {error}): train the model with "
-            "training.train(..., preprocessing=dataclasses.asdict(p)), where p is a training.Preprocessing."
+            f"the stored preprocessing is not valid ({type(error).__name__}: {error}): train the model with "
+            "training.train(..., preprocessing=dataclasses.asdict(p)), where p is a training.Preprocessing. The stored "
+            f"preprocessing is {content!r}"
         ) from error

@@ -121,7 +121,7 @@ class Scene(abc.ABC):
 
 
 class Picture(Scene):
-    """A scene of two constant images, such as images of a calibration board with the LEDs off and with the LEDs on."""
+    """A scene that never changes, given by two images, such as images of a calibration board with LEDs off and on."""
 
     def __init__(self, visual: np.ndarray, tactile: np.ndarray):
         """Store the images.
