@@ -286,7 +286,7 @@ def test_measurements_are_scored_against_the_truth_and_the_baselines(predictor):
     own = np.asarray(predictor(measurements={"load": first[:, None]}).measurements["load"])[1:, 0]
     assert found["model"] == pytest.approx(np.abs(truth - own).mean(), rel=1e-4)
     assert metric.title == "load error (N)"
-    with pytest.raises(ValueError, match="`inputs` contains 'load', but `test.measurements` does not: make"):
+    with pytest.raises(ValueError, match=r"`inputs` contains 'load', but `test\.measurements` does not: make"):
         evaluation.predict(predictor, ("load",), test._replace(measurements={}), scenario)
 
 
