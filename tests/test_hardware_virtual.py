@@ -197,10 +197,18 @@ def test_a_collection_is_continued_with_the_next_trajectory(tmp_path):
 def test_a_disk_that_is_busy_after_each_trajectory_delays_the_hand_only(tmp_path, monkeypatch):
     answers = iter(["the disk is too slow"] * 40)  # 8 s, longer than the hand waits for a contact
 
+    confirm, confirmed = hardware.Session.confirm, []
+
+    def confirming(self, number, note=""):
+        confirmed.append(number)
+        confirm(self, number, note)
+
     def busy(self):
-        if self.confirmed and (problem := next(answers, None)) is not None:
+        # `self.confirmed` grows only when the background thread has written the files, at a time that varies.
+        if confirmed and (problem := next(answers, None)) is not None:
             raise hardware.SessionError(problem)
 
+    monkeypatch.setattr(hardware.Session, "confirm", confirming)
     monkeypatch.setattr(hardware.Session, "check_ready", busy)
     scene = Spots()
     collected(scene, tmp_path, 2)
