@@ -138,8 +138,8 @@ def difference(depth: np.ndarray, truth: np.ndarray) -> Difference:
         truth: Embree's depth (m), `(h, w)`, infinite where a ray misses the object.
 
     Returns:
-        Numbers of pixels, such as those in the interior of the object with an error above 10 um. The field `worst` is
-        the largest error in the interior (m).
+        A `Difference`. Its field `worst` is the largest error in the interior of the object (m). The other fields are
+        numbers of pixels, such as the number of interior pixels with an error above 10 um.
     """
     seen, hit = np.isfinite(depth), np.isfinite(truth)
     inner = interior(truth)
@@ -185,7 +185,7 @@ def measure(
         first_seed: Offset of the seeds of the random poses.
 
     Returns:
-        The differences by name of the object. The function `total` has combined those of all images of the object.
+        A dictionary from the name of each object to the `total` of the differences in all images of the object.
     """
     sensor = sts.Sensor()
     sense = jax.jit(lambda *inputs: sts.sense(sensor, *inputs, resolution=shape))

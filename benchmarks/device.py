@@ -66,7 +66,7 @@ class Args:
 
 
 class Measured(NamedTuple):
-    """Results of the pairs of images that were read at one lag of the emulated camera.
+    """Results of reading pairs of images from an emulated camera that sends its frames with a lag.
 
     The lag is the time from the end of an exposure to the sending of the frame.
     """
@@ -87,7 +87,7 @@ class Measured(NamedTuple):
 
     @property
     def limit(self) -> float:
-        """Largest possible number of pairs per second, `1 / (2 / FPS + mean of the two settling times)`."""
+        """Largest possible number of pairs per second, `1 / (2 / FPS + mean settling time of the lights)`."""
         return 1 / (2 / FPS + (self.settling.visual_s + self.settling.tactile_s) / 2)
 
 
@@ -191,9 +191,10 @@ def measure_all(args: Args) -> list[Measured]:
 
 
 def main(args: Args) -> str:
-    """Read pairs of images at each lag of the camera (`--lags-ms`), and return a table of the results.
+    """Read pairs of images from emulated cameras with different lags, and return a table of the results.
 
-    If `--out` is given, the table is also written to this file.
+    The option `--lags-ms` lists the lags. A lag is the time from the end of an exposure to the sending of the frame. If
+    `--out` is given, the table is also written to this file.
     """
     found = measure_all(args)
     load = os.getloadavg()[1] if hasattr(os, "getloadavg") else float("nan")

@@ -375,11 +375,14 @@ def kill(bench: Bench, count: Count) -> None:
         wait_s = time.monotonic() + bench.draw.uniform(0, 3)
         _until(lambda: time.monotonic() > wait_s and lights.off_after(0.0) is None, 60)
         if process.poll() is not None or lights.off_after(0.0) is not None:
+            status = process.poll()
+            reason = (
+                "but no light was on within 60 s"
+                if status is None
+                else f"but the program ended before, with exit status {status}: see its error output above"
+            )
             raise RuntimeError(
-                "the benchmark must kill the program that reads the sensor, at a moment when a light is on. This was "
-                "not possible, because the program ended too early or no light was on within 60 s. The program's exit "
-                f"status (None: it still runs) is {process.poll()}. If the status is a number, see the program's error "
-                "output above"
+                "the benchmark must kill the program that reads the sensor, at a moment when a light is on, " + reason
             )
         process.send_signal(signal.SIGKILL)
         process.wait()

@@ -230,7 +230,7 @@ class Difference:
 
 
 def levels(field: str, values: tuple[Any, ...]) -> list[Difference]:
-    """Make a list of changes to apply to clean images. Each change has another value of one imperfection of the camera.
+    """Make a list of changes to apply to clean images. All of them change the same imperfection of the camera.
 
     Clean images are images of a digital twin that has almost no imperfections.
 

@@ -125,8 +125,8 @@ class Args:
         known = STUDIES[self.scenario].parts
         if unknown := [part for part in self.parts if part not in known]:
             raise ValueError(
-                "each positional argument names a part of the report, and must be one of "
-                f"{', '.join(known)} for --scenario {self.scenario}, got {', '.join(unknown)}"
+                f"{', '.join(unknown)}: the report for --scenario {self.scenario} has no such part. Each positional "
+                f"argument must be one of its parts, which are {', '.join(known)}"
             )
         unused = [f"--{name}" for name in ("objects", "again", "keep") if getattr(self, name) is not None]
         if self.soaked is not None and unused:
@@ -137,9 +137,9 @@ def outcomes(study: Study, starts: Starts) -> None:
     """Print the shares of outcomes, of unsettled starts, and of starts whose outcome changes with other contents.
 
     A start is the initial state of a trajectory. The outcome is how the trajectory ends, such as by toppling. A start
-    is unsettled if its object is still on the pad and not at rest at the end of the trajectory. For the last share,
-    trajectories were simulated again from the same start with other random contents of the object: another fill level
-    and, in the scenario `inclined`, contents that lie on another side of the object.
+    is unsettled if its object lies on the pad at the end of the trajectory but has not come to rest. For the last
+    share, trajectories were simulated again from the same start with other random contents of the object: another fill
+    level and, in the scenario `inclined`, contents that lie on another side of the object.
     """
     share = functools.partial(classifier.interval, classifier.mean, groups=starts.body)
     for outcome in study.scenario.outcomes:

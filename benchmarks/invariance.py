@@ -13,20 +13,20 @@ ways, which are called sides:
 - the same with half the time step
 - the same with start, jerk and object mirrored
 - the three sides above with C MuJoCo, instead of MJX, as the engine of `simulate`
-- "C MuJoCo": C MuJoCo with a plain model. The contacts are those that C MuJoCo finds for the mesh
-- "C, every vertex": C MuJoCo with a contact sphere at every vertex of the hull. The hull itself also has contacts, but
-  these act only where a rim of the pad touches the hull between the vertices
+- "C MuJoCo": C MuJoCo without `simulate`. The contacts are those that C MuJoCo itself finds for the mesh
+- "C, every vertex": as "C MuJoCo", but with a contact sphere at every vertex of the hull. The hull itself also has
+  contacts, but these act only where a rim of the pad touches the hull between the vertices
 - "C, every vertex, driven pad", for jerked bottles only: the same, but the pad is accelerated on slide joints under
   constant gravity. On all other sides, the pad is fixed and the jerk is a change of gravity
 
-C MuJoCo keeps at most four contacts of a mesh that stands on a face. A round base thus becomes a square that is up to
-30 % narrower, and rocks and walks more. With a contact at every vertex, C MuJoCo has the same contacts as the side
-"ours".
+On the side "C MuJoCo", a mesh that stands on a face has at most four contacts. A round base thus becomes a square that
+is up to 30 % narrower, and rocks and walks more. With a contact at every vertex, C MuJoCo has the same contacts as the
+side "ours".
 
-The command prints the share of each label on the side "ours" and on each other side, with the 95 % interval of the
-difference. All sides have the same starts and hidden properties (such as friction), so each run on the side "ours" is
-paired with a run on each other side. The interval is computed for paired proportions (Agresti and Min 2005, with half a
-count added to each cell). The command writes no files.
+The command prints the share of each label on all sides. For each side other than "ours", it also prints the 95 %
+interval of the difference from "ours". All sides have the same starts and hidden properties (such as friction), so each
+run on the side "ours" is paired with a run on each of the other sides. The interval is computed for paired proportions
+(Agresti and Min 2005, with half a count added to each cell). The command writes no files.
 """
 
 import concurrent.futures
@@ -343,11 +343,12 @@ def sides(case: Case, num: int) -> dict[str, np.ndarray]:
 
 
 def compare(found: dict[str, np.ndarray], labels: Sequence[str], margin: float = MARGIN) -> bool:
-    """Print how often the runs end in each way, compared between the side "ours" and each other side.
+    """Print how often the runs end in each way, and compare the side "ours" with each of the other sides.
 
     A side is one way to compute the same runs, such as another time step or another physics engine. The label of a run
-    states how the run ends, such as "lies". For each label and each other side, the share of the label on "ours", its
-    share on the other side, and the 95 % confidence interval of the difference between the two shares are printed.
+    states how the run ends, such as "lies". The share of a label on a side is the share of the runs with this label.
+    For each label, the function compares its share on "ours" with its share on each of the other sides. It prints both
+    shares and the 95 % confidence interval of their difference.
 
     Args:
         found: Index of the label of every run, by name of the side. The side "ours" must be the first.
@@ -374,10 +375,10 @@ def compare(found: dict[str, np.ndarray], labels: Sequence[str], margin: float =
 
 
 def main(args: Args) -> None:
-    """Simulate each case on all sides, and print the comparison of the sides.
+    """Simulate each case in several ways, and print a comparison of the results.
 
-    A side is one way to simulate a case, such as with half the time step or with C MuJoCo (see the docstring of the
-    module). With `--only`, a single case is simulated.
+    The ways, such as half the time step or the engine C MuJoCo, are called sides and are listed in the docstring of the
+    module. With `--only`, a single case is simulated.
     """
     within = [compare(sides(case, args.num), case.labels) for case in cases() if args.only in (None, case.name)]
     print(f"every interval within {100 * MARGIN:.0f} points: {'yes' if all(within) else 'NO'}")

@@ -119,8 +119,8 @@ def skin_under_ball(
         shape: Height and width of the image (pixels).
 
     Returns:
-        Unit normals towards the camera, and points (m). The origin is in the middle of the image. The rim of the
-        contact lies in the plane z = 0 of the flat skin.
+        Unit normals towards the camera, and points (m). The origin is in the middle of the image. The skin outside the
+        contact is flat and lies in the plane z = 0, which contains the contact's rim.
     """
     x, y = PITCH * (column - centre[0]), PITCH * (row - centre[1])
     under = np.sqrt(RADIUS**2 - x**2 - y**2)

@@ -321,7 +321,7 @@ def ball(shape: tuple[int, int], pitch: float, *, radius: float = 4e-3, depth: f
         depth: Largest depth of the imprint (m).
 
     Returns:
-        Depth of the imprint (m), `shape`.
+        Depth of the imprint (m), an array of the given shape.
     """
     y, x = ((np.arange(n) - (n - 1) / 2) * pitch for n in shape)
     square = radius**2 - x[None, :] ** 2 - y[:, None] ** 2
@@ -337,7 +337,7 @@ def waves(shape: tuple[int, int], pitch: float, *, depth: float = 1e-3) -> np.nd
         depth: Largest depth of the imprint (m).
 
     Returns:
-        Depth of the imprint (m), `shape`.
+        Depth of the imprint (m), an array of the given shape.
     """
     y, x = ((np.arange(n) - (n - 1) / 2) * pitch for n in shape)
     return (depth * (0.6 + 0.2 * np.sin(2e3 * x)[None, :] + 0.2 * np.sin(1.4e3 * y)[:, None])).astype(np.float32)

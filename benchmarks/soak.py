@@ -137,8 +137,7 @@ def report(name: str, found: dict[str, np.ndarray]) -> str:
 
     Args:
         name: Name of the scenario.
-        found: Arrays with the names and meanings of the result of the function `block`, and with a row for each
-            trajectory of the scenario.
+        found: Arrays by name, as `block` returns them. Each array has one row for each trajectory of the scenario.
     """
     outcome = found["outcome"]
     shares = {o.name.lower(): np.mean(outcome == o) for o in SCENARIOS[name].outcomes}

@@ -30,8 +30,8 @@ def features(tactile: np.ndarray, blank: np.ndarray) -> np.ndarray:
     """Compute 11 features of the imprint in each image, from the number and the darkness of the imprint's pixels.
 
     The imprint consists of the pixels whose value in any channel differs by more than 3 (of 255) from `blank`.
-    The darkness of a pixel in a channel is -log(value / value in `blank`). For each pixel, `most` is its largest
-    darkness in a channel, but at least 0, and `mean` is the mean of its darkness over the channels. The features are:
+    The darkness of a pixel in a channel is -log(value / value in `blank`). For each pixel, `most` is the
+    maximum of its darkness over the channels, but at least 0. `mean` is the mean over the channels. The features are:
 
     - the logarithms of four quantities of the imprint: the sum of `most`, the sum of `mean`, the sum of the positive
       values of `mean`, and the number of pixels

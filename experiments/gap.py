@@ -4,8 +4,9 @@
         --simulated runs/twin/dataset --simulated-sensor runs/twin
     python -m experiments.gap --real runs/real/dataset --sensor bench --simulated runs/released/dataset --match none
 
-`--real` and `--simulated` are folders of trajectories that `experiments.real collect` recorded. `--simulated` may also
-be the dataset of an experiment that was run with `--collection.no-crop`. Raw images are rectified with the lens of the
+`--real` is a folder of trajectories that `experiments.real collect` recorded with a sensor. `--simulated` is a folder
+that `experiments.real collect --twin` recorded with the digital twin, a simulated sensor. It may also be the dataset of
+an experiment that was run with `--collection.no-crop`. Raw images are rectified with the lens of the
 sensor file. By default, a real and a simulated trajectory with the same number must show the same object in the same
 poses. Give `--match none` if the two folders show the same object in different poses.
 
@@ -81,7 +82,8 @@ def session(folder: Path, sensor: Path | None, resolution: tuple[int, int]) -> S
     Raises:
         FileNotFoundError: There are no recorded trajectories or no sensor file.
         SensorFileError: The sensor file is damaged or describes no device.
-        ValueError: The user has confirmed no trajectory, or the lens was calibrated with images of another size.
+        ValueError: None of the recorded trajectories was confirmed by the user, or the lens was calibrated with images
+            of another size.
     """
     recordings = hardware.load_recordings(folder)
     size = f"{resolution[0]} x {resolution[1]}"

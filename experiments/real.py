@@ -18,8 +18,8 @@ object at rest from the images of the held object. Results go to `WORKDIR/table2
 sub-command prints the expected seconds of each stage before the first stage, unless there are results already. A work
 directory cannot contain trajectories of both a device and the twin, so give the twin a separate `--workdir`.
 
-`--sensor` is the sensor file of `experiments.commission`. The sensor file contains the lens and images of the empty
-pad. Training needs the lens and these images.
+`--sensor` is the sensor file of `experiments.commission`. The sensor file contains the calibration of the lens, and
+images of the empty pad. Training needs both.
 
 `collect` guides a person through trajectories: place the object in an unstable pose, hold the object, release the
 object, and wait until the object rests. A trajectory has two pairs of a visual and a tactile image. The first pair

@@ -73,11 +73,16 @@ def look(config: Config, sensor: sts.Sensor, body: sts.objects.Body) -> tuple[st
 
 
 def panels(frame: sts.Frame, between: np.ndarray, light: float) -> list[tuple[str, np.ndarray]]:
-    """Return a caption and an image in [0, 1] for each image of a frame.
+    """Return a list of images in [0, 1] with their captions.
 
-    The images are the visual image, the argument `between`, the tactile image, the depth, the segmentation and the
-    pressure on the gel. `between` is an image with the LEDs at the share `light` of their full power. In the depth
-    image, near points are bright. The pressure image has the resolution of the gel's grid.
+    The images are the visual image, the image `between`, the tactile image, the depth, the segmentation and the
+    pressure on the gel. In the depth image, near points are bright. The pressure image has the resolution of the gel's
+    grid.
+
+    Args:
+        frame: Visual image, tactile image and true quantities of an object on the sensor.
+        between: Image of the same object with dimmed LEDs.
+        light: Power of the LEDs in `between`, as a share of full power.
     """
     seen = np.asarray(frame.segmentation)
     depth = np.where(seen, np.asarray(frame.depth), np.nan)

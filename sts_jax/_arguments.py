@@ -107,7 +107,8 @@ def checked_measurements(measurements: Any, reserved: tuple[str, ...]) -> dict[s
     """Check the argument `measurements` of a `Predictor`, and return its entries that are not None.
 
     Args:
-        measurements: Dictionary from the name of a further modality to its values. None for no values.
+        measurements: Dictionary from the name of each further modality to its values. A value of None means that the
+            modality was not measured. None instead of the dictionary means that no further modality was measured.
         reserved: Names of the modalities that have an argument of their own.
 
     Raises:

@@ -233,9 +233,11 @@ def _check_sensor(sensor: Any) -> None:
 def _check_kinds(sensor: Any, body: Any) -> None:
     _check_sensor(sensor)
     if not isinstance(body, Body):
-        several = isinstance(body, Sequence) and not isinstance(body, str)
-        remedy = "For several bodies use objects.stack and jax.vmap" if several else "objects.load reads a mesh file"
-        raise TypeError(f"body is {body!r}, but it must be one Body. {remedy}")
+        if isinstance(body, Sequence) and not isinstance(body, str):
+            found, remedy = f"a {type(body).__name__}", "For several bodies use objects.stack and jax.vmap"
+        else:
+            found, remedy = repr(body), "objects.load reads a mesh file"
+        raise TypeError(f"body is {found}, but it must be one Body. {remedy}")
     if body.vertices.ndim != 2 or not is_traced(body):
         body.check()
 

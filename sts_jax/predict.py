@@ -205,7 +205,9 @@ class Predictor:
         every = {"visual": visual, "tactile": tactile, "pose": pose, **own}
         given = {name: value for name, value in every.items() if value is not None}
         if not given:
-            raise ValueError(f"nothing to predict from: give at least one of {', '.join(self.modalities)}.")
+            raise ValueError(
+                f"nothing to predict from: give at least one of these arguments: {', '.join(self.modalities)}."
+            )
         arrays = {name: self._checked_name(name, value) for name, value in given.items()}
         leads = {name: array.shape[: array.ndim - len(self._shapes[name])] for name, array in arrays.items()}
         lead = next(iter(leads.values()))

@@ -204,7 +204,7 @@ def test_an_invalid_traced_measurement_gives_nan_in_its_item_alone(predictor):
         ({"sound": np.zeros(1, np.float32)}, "does not accept sound: the model was trained on load"),
         ({"pose": np.zeros(7, np.float32)}, "measurements must not have the key 'pose': pass these values as"),
         ([1.0], "measurements has the type list, but it must be a dict"),
-        ({}, "nothing to predict from: give at least one of load"),
+        ({}, "nothing to predict from: give at least one of these arguments: load"),
     ],
 )
 def test_a_wrong_measurement_is_named(predictor, measurements, message):

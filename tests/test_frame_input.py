@@ -77,7 +77,7 @@ def test_other_types_than_sensor_and_body_raise_an_error():
         ((SENSOR, "mug.obj"), r"body is 'mug\.obj', but it must be one Body\. objects\.load reads a mesh file"),
         (
             (SENSOR, [BODY, BODY]),
-            r"body is .*, but it must be one Body\. For several bodies use objects\.stack and jax\.vmap",
+            r"body is a list, but it must be one Body\. For several bodies use objects\.stack and jax\.vmap",
         ),
         ((SENSOR, None), "body is None, but it must be one Body"),
         (("sensor.json", BODY), r"sensor is 'sensor\.json', but it must be a Sensor"),

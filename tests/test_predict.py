@@ -149,7 +149,7 @@ def broken(name, change):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({}, "nothing to predict from: give at least one of visual, tactile, pose"),
+        ({}, "nothing to predict from: give at least one of these arguments: visual, tactile, pose"),
         (broken("visual", lambda x: x[:, 1:]), r"visual has shape \(2, 31, 32, 3\).*resolution=\(32, 32\)"),
         (broken("visual", lambda x: x * 255), "visual has values in .*divide by 255"),
         (broken("visual", lambda x: (x * 255).astype(np.uint8)), "visual is uint8"),

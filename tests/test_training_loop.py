@@ -330,7 +330,7 @@ def test_a_state_space_model_memorises_four_samples(tmp_path):
         ({"empty": {"visual": np.zeros((8, 8, 3), np.uint8)}}, r"`empty` has .* of shape \(16, 16, 3\)"),
         ({"present": {"tactile": np.ones(4, bool)}}, r"^`present` has masks for \['tactile'\]"),
         ({"target_present": {"tactile": np.ones(4, bool)}}, r"`target_present` has masks for \['tactile'\]"),
-        ({"condition": np.ones((4, 3), np.float32)}, "`condition` has width 3"),
+        ({"condition": np.ones((4, 3), np.float32)}, "`condition` is an array of width 3, but it must be None"),
     ],
 )
 def test_arrays_that_do_not_fit_a_state_space_model_are_named(tmp_path, change, message):

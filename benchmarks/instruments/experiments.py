@@ -1,4 +1,4 @@
-"""The experiments whose configurations the benchmarks use, by the name of their scenario."""
+"""Dictionary from the name of a scenario to the experiment whose configuration the benchmarks use."""
 
 from experiments import freefall, inclined, perturbed, released
 

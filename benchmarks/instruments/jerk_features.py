@@ -20,8 +20,8 @@ NOISE = 0.05  # standard deviation of the measured log mass, about 5 % of the ma
 class Sight(NamedTuple):
     """Properties computed from the shapes of objects.
 
-    The field `rigid` has the mass properties of each object at 17 fill levels of its interior, from empty to full. Each
-    array has one row for each object.
+    The field `rigid` has the mass properties of each object at 17 fill levels of its interior, from empty to full. The
+    first axis of each of the three fields is the axis of the objects.
     """
 
     profile: np.ndarray  # (b, 10) m: radius of the base, height, greatest radius, radii at seven heights
@@ -55,14 +55,15 @@ def sight(items: list[objects.Body]) -> Sight:
 
 
 def weighed(starts: Starts) -> np.ndarray:
-    """True logarithm of the mass in kg, `(n, 1)`, which the tactile image of a standing object shows approximately."""
+    """Logarithm of the true masses in kg, `(n, 1)`. Tactile images of standing objects show approximately this."""
     return np.log(starts.mass)[:, None]
 
 
 def canonical(pose: np.ndarray, condition: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotate or mirror each start by a symmetry of the square pad, so that the push points 0 to 45 degrees from +x.
+    """Rotate or mirror each trajectory's start by a symmetry of the pad, so that the push is 0 to 45 degrees from +x.
 
-    The push is the acceleration of the object in the frame of the pad, opposite to the acceleration of the pad.
+    The start is the position of the object in the first frame, and the push. The push is the acceleration of the object
+    in the frame of the pad, opposite to the acceleration of the pad.
 
     Args:
         pose: Poses in the first frame, `(n, 7)`.
@@ -85,8 +86,8 @@ def tipping(rigid: np.ndarray, base: np.ndarray, push: np.ndarray, time: np.ndar
     The object begins to tip at the acceleration g b / h, where b is the radius of the base and h is the height of the
     centre of mass. The first ratio is the acceleration divided by g b / h. The second ratio is the energy at the end of
     the push divided by the energy that lifts the centre of mass over the edge. Both ratios exceed 1 for an object that
-    topples. The second ratio takes into account that friction limits the force of the push. A limited force acts longer
-    than `time`, so that force times duration stays the same.
+    topples. The second ratio takes into account that friction limits the force of the push. If the push is stronger
+    than the friction, the function replaces it by a longer push with the force of the friction and the same impulse.
 
     Args:
         rigid: Mass (kg), height of the centre of mass (m), and inertia about a horizontal axis through the centre of

@@ -210,7 +210,7 @@ class SensorPeer:
     def shown(self) -> dict[int, Shown]:
         """Return the mean light during the exposure of each frame that the emulated camera has logged.
 
-        The result is a dictionary from the number of a frame to its `Shown`. `key` reads this number from an image.
+        The keys of the returned dictionary are the numbers of the frames. `key` reads this number from an image.
         """
         return {number: Shown(number, exposure.mean) for number, exposure in self.camera.log.items()}
 

@@ -234,7 +234,7 @@ class AutomaticTerminal(AutomaticPerson):
 
 
 class AutomaticPage(AutomaticPerson):
-    """A `Person` that confirms every trajectory automatically and shows a page whose buttons can also be pressed."""
+    """A program that confirms every trajectory in place of a person, and shows a page with buttons for the user."""
 
     def __init__(self, page: Page):
         super().__init__()

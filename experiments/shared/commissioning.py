@@ -156,9 +156,8 @@ def fit(pictures: boards.Pictures, pinhole: hardware.Pinhole) -> hardware.Lens:
     """Calibrate the lens from pictures of the board, and print the error of each picture.
 
     Raises:
-        CalibrationError: The pictures do not determine the lens or do not cover the view of the sensor, or the raw
-            image does not contain the whole view. The view is the part of the gel's outer face that rectified images
-            show.
+        CalibrationError: The pictures do not determine the lens, or they do not cover the part of the gel's outer face
+            that rectified images show, or the camera does not see this whole part.
     """
     say(f"board: {len(pictures.names)} pictures in {pictures.folder}, {pictures.describe()}")
     calibration = pictures.fit(pinhole)

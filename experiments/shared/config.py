@@ -110,7 +110,7 @@ def paper(collection: dataset.Collection, *, num_objects: int, num_per_object: i
     All frames of all trajectories are rendered.
 
     Args:
-        collection: Collection of the default experiment, with the scenario and the object classes.
+        collection: Settings for the data of the default experiment, such as the scenario and the object classes.
         num_objects: Number of objects.
         num_per_object: Number of trajectories of each object.
     """

@@ -199,7 +199,7 @@ def _scored(
 
 
 def main_rows(model: str, titles: Sequence[str]) -> list[str]:
-    """Titles of the rows of the main table: ceiling, baselines, and the main model with up to five sets of inputs.
+    """Titles of the main table's rows: ceiling, baselines, and one row for each set of inputs of the main model.
 
     The row of the ceiling has the scores of a prediction that averages over re-rolls. A re-roll is another simulation
     from the same initial state, with new random hidden properties such as friction.

@@ -26,10 +26,10 @@ _ROWS = 6  # largest number of panels of a picture, which are chosen evenly from
 
 
 def panel(seen: Seen) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw the live display at one time as an RGB image, which is called a panel.
+    """Draw one snapshot of the live display as an RGB image.
 
-    A panel shows the live images, the predicted images, the outcome probabilities, the prediction rate and the latency.
-    All panels have the same size.
+    Such an image is called a panel. A panel shows the live images, the predicted images, the outcome probabilities, the
+    prediction rate and the latency. All panels have the same size.
     """
     found = seen.predicted
     images = [seen.visual, seen.tactile, *([] if found is None else [found.visual, found.tactile])]

@@ -245,7 +245,7 @@ def run(
 def calibrate(job: Job, model: statespace.Config, folder: Path, config: Config, validation: dataset.Pairs) -> None:
     """Calibrate a trained state-space model on the validation trajectories, and write `calibration.json`.
 
-    The calibration corrects the density of the predicted pose and the probabilities of the outcomes for new objects.
+    The calibration corrects two predictions: the density of the pose, and the probabilities of the outcomes.
 
     Args:
         job: The training of the model, from `jobs`. Only its preprocessing and its images of the untouched sensor are

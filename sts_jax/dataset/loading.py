@@ -322,10 +322,9 @@ class Dataset:
         without = trajectories[~np.isin(trajectories, self.rendered())]
         if without.size:
             raise ValueError(
-                f"`trajectories` contains {without[0]}, which has no images "
-                f"(num_rendered={self.collection['num_rendered']} is the number of each object's trajectories that "
-                "have images)"
-                ": use `ends`, which needs no images, or take indices from `members` or `rendered`."
+                f"`trajectories` contains {without[0]}, which has no images: use `ends`, which needs no images, or "
+                "take indices from `members` or `rendered`. The number of trajectories with images of each object is "
+                f"num_rendered={self.collection['num_rendered']} in this dataset."
             )
         last = self.trajectory["pose"].shape[1] - 1
         kinds = np.unique(self.frames[:, 2]).tolist() if symmetries else [0]

@@ -74,8 +74,8 @@ def measured(
         measurements: The specifications of the modalities.
         data: The dataset, a `Dataset`.
         trajectories: Indices of n trajectories, int `(n,)`.
-        symmetries: Numbers of the k symmetries of the copies (`dataset.symmetry`). Number 0 stands for the trajectory
-            itself.
+        symmetries: The k copies of each trajectory, given as indices of the symmetries of `dataset.symmetry` that
+            produce them. The symmetry with index 0 produces the trajectory itself.
 
     Returns:
         The values of each modality by name, uint8 or float32 `(n * k, 2, *shape)`. The k copies of a trajectory are

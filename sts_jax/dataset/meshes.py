@@ -137,8 +137,7 @@ def open_library(meshes: Meshes, parts: bool) -> tuple[objects.Library, dict[str
     """Make an `objects.Library` of all mesh files in the folder `meshes.folder`, without opening a mesh.
 
     Args:
-        meshes: Mesh files that `survey_meshes` returned. The library also contains the mesh files of the folder that
-            `survey_meshes` left out.
+        meshes: Result of `survey_meshes`. The library also contains the mesh files that `survey_meshes` left out.
         parts: True to split an object into convex parts if its convex hull reaches more than 2 mm beyond its surface.
 
     Returns:

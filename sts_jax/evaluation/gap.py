@@ -123,20 +123,21 @@ def features(images: np.ndarray) -> np.ndarray:
 def energy_distance(
     real: np.ndarray, simulated: np.ndarray, real_group: np.ndarray, simulated_group: np.ndarray, *, seed: int = 0
 ) -> Distance:
-    """Compute the normalised energy distance `1 - (E|X - X'| + E|Y - Y'|) / (2 E|X - Y|)` of two sets of features.
+    """Compute the normalised energy distance of two sets of features, and test whether their distributions differ.
 
-    X and X' are the features of two real images, and Y and Y' are those of two simulated images. E is the mean over
-    pairs of images, and `|.|` is the Euclidean norm. The distance is 0 for equal distributions and 1 for sets that are
-    far apart. Each feature is first divided by its standard deviation over both sets. If this deviation is below one
-    grey level (1/255), the feature is divided by one grey level instead.
+    The distance is `1 - (E|X - X'| + E|Y - Y'|) / (2 E|X - Y|)`. X and X' are the features of two real images, and Y
+    and Y' are those of two simulated images. E is the mean over pairs of images, and `|.|` is the Euclidean norm. The
+    distance is 0 for equal distributions and 1 for sets that are far apart. Each feature is first divided by its
+    standard deviation over both sets. If this deviation is below one grey level (1/255), the feature is divided by one
+    grey level instead.
 
     The three means use only pairs of images from different trajectories. An image is therefore never paired with
     itself, so the estimate has no bias that depends on the number of images. Trajectories that occur in both sets also
     cause no bias. For equal distributions, the estimate varies around 0 and may be negative.
 
-    The p-value comes from a permutation test. If both sets have the same trajectories, a permutation exchanges the real
-    and the simulated images of randomly selected trajectories. If they have no common trajectory, a permutation
-    distributes the trajectories to the two sets at random.
+    The test is a permutation test, and its p-value is a part of the result. If both sets have the same trajectories, a
+    permutation exchanges the real and the simulated images of randomly selected trajectories. If they have no common
+    trajectory, a permutation distributes the trajectories to the two sets at random.
 
     Args:
         real: Features of the real images, from `features`, `(n, k)`.

@@ -78,8 +78,8 @@ def outcome_of_image(
 ) -> np.ndarray:
     """Determine from the last visual image of each trajectory whether the object fell off.
 
-    The outcome is `FELL_OFF` if the image shows no object. Otherwise, it is always `stays`. The images are not used to
-    distinguish the outcomes of objects that stay on the pad.
+    The outcome is `FELL_OFF` if the image shows no object. Otherwise, it is the value of the argument `stays`, because
+    the function does not distinguish between the outcomes of objects that stay on the pad.
 
     Args:
         visual: Images in [0, 1], `(n, height, width, 3)`.

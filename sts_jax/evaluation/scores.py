@@ -161,8 +161,8 @@ def _with_probability(
     if probability.shape != (len(test.outcome), len(outcomes)):
         raise ValueError(
             f"outcome_probability has shape {probability.shape}, but it must have shape "
-            f"{(len(test.outcome), len(outcomes))}, with one row for each item and one column for each member of the "
-            "argument `outcomes`: pass outcomes=scenario.outcomes"
+            f"{(len(test.outcome), len(outcomes))}, with one row for each item of `test` and one column for each "
+            "member of `outcomes`: pass the items that were predicted, and outcomes=scenario.outcomes"
         )
     number = np.array([int(outcome) for outcome in outcomes])
     likeliest = number[probability.argmax(1)]

@@ -1,4 +1,4 @@
-"""`Connection`: a serial connection to the LED controller that repeats each request until its answer arrives."""
+"""`Connection`: a serial connection to the LED controller. Each request is repeated until an answer arrives."""
 
 import logging
 import random

@@ -92,8 +92,8 @@ def board_image(board: Board = Board(), *, outline: tuple[float, float] = (0.15,
 
     Args:
         board: The board to draw.
-        outline: Width and height of the frame around the board (m). Use the width and height of the sensor's gel
-            pad. The board is then centred on the pad when the cut sheet covers the pad exactly.
+        outline: Width and height of the frame around the board (m). Use the width and height of the sensor's gel pad,
+            so that the cut sheet covers the pad exactly and the board is in the middle of the pad.
 
     Returns:
         Grey image with 10 pixels per mm, shape (2970, 2100), uint8.

@@ -128,8 +128,8 @@ class RecordedFilm(Film):
         if there < len(places):
             raise DamagedFileError(
                 f"{path} is truncated: it has {there} of the {len(places)} images that {FRAMES} lists for the {stream} "
-                f"stream. {_AGAIN.capitalize()}, or remove the missing images from {FRAMES}: of the lines "
-                f"with stream {stream!r}, delete the last ones (number of lines: {len(places) - there})."
+                f"stream. {_AGAIN.capitalize()}, or open {FRAMES}, and delete the last {len(places) - there} of the "
+                f"lines that contain stream {stream!r}."
             )
 
     def image(self, index: int) -> Image:

@@ -164,8 +164,8 @@ class ProvenFrames:
         slowest_s = max(found.visual_s, found.tactile_s)
         if slowest_s > watch_s - period_s:
             raise LightError(
-                f"the image was still changing at the end of the measurement, about {slowest_s:.2f} s after the lights "
-                f"were switched (frames were collected for {watch_s:.2f} s): keep the scene at rest and lock the "
+                f"the image was still changing about {slowest_s:.2f} s after the lights were switched, and the "
+                f"measurement ended after {watch_s:.2f} s: keep the scene at rest and lock the "
                 "camera's exposure. If the lights are slow, pass their settling times as "
                 "STS(settling=Settling(visual_s, tactile_s))."
             )

@@ -61,8 +61,8 @@ class RecordedTrajectory:
 class Entry(NamedTuple):
     """A trajectory in the result of `list_recordings`: its number, state, time and note.
 
-    The field `standing` holds the state of the trajectory: "confirmed", "unconfirmed" (both pairs of images exist),
-    "incomplete" (a pair of images is missing) or "discarded".
+    The field `standing` holds the state of the trajectory: "confirmed", "unconfirmed" (the initial and the final pair
+    of images exist), "incomplete" (at least one of the two pairs is missing) or "discarded".
     """
 
     number: int  # number of the trajectory in its session
@@ -81,7 +81,7 @@ class Images(NamedTuple):
 
 
 class Recordings:
-    """The trajectories of a session that the user has confirmed, as a sequence of `RecordedTrajectory` objects.
+    """All confirmed trajectories of a session, as a sequence of `RecordedTrajectory` objects.
 
     ```python
     for trajectory in hardware.load_recordings("runs/real/dataset"):

@@ -183,8 +183,8 @@ class Session:
         """
         if (problem := self.problem) is not None:
             raise SessionError(
-                f"cannot start a new trajectory, because the last attempt to write failed: {problem} "
-                f"Number of changes that are not on disk yet: {self.waiting}."
+                "cannot start a new trajectory, because the last attempt to write failed. Number of changes that are "
+                f"not on disk yet: {self.waiting}. Error: {problem}"
             )
         if (waiting := self.waiting) > _QUEUE - _JOBS_OF_TRAJECTORY:
             raise SessionError(

@@ -29,14 +29,14 @@ def conv(
 
     Args:
         x: Images. Pixels outside their borders count as 0.
-        kernel: Weight for each kernel pixel, input channel and output channel. `size`, the height and width of the
-            kernel, must be a multiple of `stride`.
+        kernel: Weights of shape (size, size, in, out). The side `size` of the kernel must be a multiple of `stride`.
+            The third axis belongs to the channels of `x`, and the fourth axis to the channels of the output.
         stride: Step of the kernel from one output pixel to the next, in input pixels.
         padding: Number of zeros before the first and after the last pixel of each axis, at most `size - 1`.
 
     Returns:
-        Images with `ho = (h + 2 padding - size) // stride + 1` rows. The number of columns follows from `w` in the same
-        way.
+        Images with `(h + 2 padding - size) // stride + 1` rows, where h is the number of rows of `x`. The number of
+        columns follows from the number of columns of `x` in the same way.
     """
     height, width = (n + 2 * padding - len(kernel) + 1 for n in x.shape[1:3])
     if stride == 1 and (height + len(kernel) - 1) * (width + len(kernel) - 1) <= _SMALL:
@@ -55,14 +55,14 @@ def conv_transpose(
 
     Args:
         x: Images.
-        kernel: Weights. `size` must be a multiple of `stride`. The third axis belongs to the channels of `x`, and the
-            fourth axis to the channels of the output.
+        kernel: Weights of shape (size, size, in, out). The side `size` of the kernel must be a multiple of `stride`.
+            The third axis belongs to the channels of `x`, and the fourth axis to the channels of the output.
         stride: Step of the kernel from one input pixel to the next, in output pixels.
         padding: Number of rows and columns that are cut from each side of the output.
 
     Returns:
-        Images with `ho = stride (h - 1) + size - 2 padding` rows. The number of columns follows from `w` in the same
-        way.
+        Images with `stride (h - 1) + size - 2 padding` rows, where h is the number of rows of `x`. The number of
+        columns follows from the number of columns of `x` in the same way.
     """
     height, width = (stride * (n - 1) + len(kernel) - 2 * padding for n in x.shape[1:3])
     if stride == 1 and (height + 2 * padding) * (width + 2 * padding) <= _SMALL:

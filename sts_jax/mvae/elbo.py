@@ -96,8 +96,10 @@ def loss(
 
     For each modality, one call of the decoder predicts the targets for all subsets. Batch normalisation computes one
     mean and one variance of each channel for this call. A prediction for n equal subsets has the weight n in this
-    mean and this variance. If two subsets have the same present modalities in a sample, they use the same noise for the
-    latent `z`.
+    mean and this variance.
+
+    In each sample, a subset uses only those of its modalities that the masks in `present` do not exclude. Two subsets
+    that use the same modalities of a sample also use the same noise for the latent `z` of this sample.
 
     Args:
         graphdef: Definition of the model, from `init`.

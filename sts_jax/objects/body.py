@@ -180,7 +180,7 @@ def _sizes(body: Body) -> str:
 
 
 def mirror(body: Body) -> Body:
-    """Mirror a body, or every body in a result of `stack`, so that y becomes -y in the mesh frame."""
+    """Mirror a body, or every body in a result of `stack`, by changing the sign of all y coordinates."""
     flip = jnp.array([1.0, -1, 1])
     corners = jnp.array([0, 2, 1])  # so that faces stay counter-clockwise from outside
     return dataclasses.replace(

@@ -134,7 +134,8 @@ def load(
         IsADirectoryError: The path is a folder.
         PermissionError: The file is not readable.
         ValueError: The file is empty, truncated or not a mesh, or an image cannot be read. The mesh is flat, has no
-            faces or too many faces, or has a vertex that is not finite. Its longest side is above 0.15 m or below 5 mm.
+            faces, or has a vertex that is not finite. It has more faces or vertices than the renderer can draw, and
+            `faces` is None. Its longest side is above 0.15 m or below 5 mm.
             The mesh lacks the texture coordinates that `texture` needs. `strict` is True, and the mesh is not closed or
             encloses no volume. The mesh cannot be decimated to `faces`, or cannot be decomposed into convex parts. An
             argument is out of range.
@@ -331,8 +332,8 @@ def _body(
         fault = "encloses no volume" if closed else "is not closed"
         if strict:
             raise ValueError(
-                f"{path}: the mesh {fault}: repair the mesh, or give strict=False. With strict=False, the contents of "
-                "a hollow object fill the convex hull of the mesh"
+                f"{path}: the mesh {fault}: repair the mesh, or give strict=False. With strict=False, the space that "
+                "the object's contents can fill is the convex hull of the mesh"
             )
         if holds:
             warnings.warn(

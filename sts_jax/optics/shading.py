@@ -125,10 +125,10 @@ def hidden_sky(
 
         hidden = max_z Y_z slice_z X_z^T
 
-    slice_z is the opacity of the slice in each cell, times the share of the cell inside the outline. X_z[i, j] is the
-    share of the sky that a strip over column j at the height z hides from the centre of column i. Y_z is the same
-    matrix for rows instead of columns. The maximum over the slices is taken in each cell. Quadratic splines interpolate
-    between the cells.
+    slice_z is the opacity of the slice in each cell, times the fraction of the cell's area that is inside the outline.
+    X_z[i, j] is the share of the sky that a strip over column j at the height z hides from the centre of column i. Y_z
+    is the same matrix for rows instead of columns. The maximum over the slices is taken in each cell. Quadratic splines
+    interpolate between the cells.
 
     Args:
         heights: Heights of the object's underside above the gel's face (m), on a uniform grid of r rows and c columns

@@ -5,16 +5,18 @@ the box. The edges of a small object on a large pad then have contacts with the 
 push the object. The object then never comes to rest, or is thrown off. MJX would also compile its test again for every
 mesh.
 
-The pad and the stop wall (as in `Inclined`) are boxes whose sides are parallel to the axes. The contacts of a convex
-hull with such a box can be of four kinds. This module computes three of these kinds:
+The pad and the stop wall (as in `Inclined`) are boxes whose sides are parallel to the axes. The four edges of the top
+of a box are called its rims. The contacts of a convex hull with such a box can be of four kinds. This module computes
+three of these kinds:
 
 - A vertex of the hull lies inside the box. The vertex is pushed out through the nearest of the top and the four sides.
-- An edge of the hull crosses a rim of the top. The edge is pushed along the common normal of edge and rim.
+- An edge of the hull crosses a rim. The edge is pushed along the common normal of edge and rim.
 - A corner of the top lies inside the hull. The hull is pushed along the normal of the nearest lower face of the hull.
 
-The distance of each contact is exact along its normal. The fourth kind is left out: an edge of the hull crosses an
-upright edge of the box below the top. Only objects that have fallen off the pad meet the upright edges. Nothing stops
-the edges of these objects at the upright edges. The tests compare the contacts with the contacts of a mesh in C MuJoCo.
+The distance of each contact is exact along its normal. The fourth kind is left out: an edge of the hull crosses one of
+the four vertical edges of the box. Only objects that have fallen off the pad meet these vertical edges. Such an object
+can penetrate a vertical edge without a contact. The file `tests/test_physics_contact.py` compares the contacts that
+this module finds with those that C MuJoCo finds for a mesh.
 """
 
 from typing import NamedTuple
@@ -245,9 +247,9 @@ def collide(
 ) -> Contacts:
     """Find the contacts between an object and a box. The top of the box is centred at the origin.
 
-    There is a candidate for each vertex of the object inside the box, for each edge of the object that crosses a rim
-    of the top, and for each corner of the top inside the object. A candidate can become a contact if its depth is above
-    0 and above the largest depth minus 1 mm (`SKIN`).
+    There is a candidate for each vertex of the object inside the box, for each crossing of an edge of the object with
+    one of the four edges of the top, and for each corner of the top inside the object. A candidate can become a contact
+    if its depth is above 0 and above the largest depth minus 1 mm (`SKIN`).
 
     The first contact is the deepest candidate. The second contact is the deepest of the candidates that are more than
     1 mm (`APART`) away from the first contact. For each of `num` - 2 evenly spaced directions, the candidate with the

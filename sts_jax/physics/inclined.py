@@ -78,7 +78,7 @@ class Inclined(Scenario):
         if not 0 <= self.slope < math.pi / 2:
             raise ValueError(
                 f"scenario.slope is {self.slope} rad, but it must be >= 0 and < pi / 2 "
-                "(give degrees as math.radians(30))"
+                "(30 degrees are math.radians(30))"
             )
         check_length("wall", self.wall)
         check_length("across", self.across)

@@ -81,13 +81,13 @@ class Released(Scenario):
         check_length("spread", self.spread)
         if not 0 <= self.skew <= TURNED:
             raise ValueError(
-                f"scenario.skew is {self.skew} rad, but it must be from 0 to pi / 4 (give degrees as math.radians(4))"
+                f"scenario.skew is {self.skew} rad, but it must be from 0 to pi / 4 (4 degrees are math.radians(4))"
             )
         low, high = self.beyond
         if not -TURNED <= low <= high <= TURNED:
             raise ValueError(
                 f"scenario.beyond is {self.beyond} rad, but it must be (low, high) with -pi / 4 <= low <= high <= "
-                "pi / 4 (give degrees as math.radians(10))"
+                "pi / 4 (10 degrees are math.radians(10))"
             )
         check_range("carried", self.carried)
         if self.carried[1] > 1:
@@ -103,14 +103,14 @@ class Released(Scenario):
 
         See `Scenario.start` for the arguments.
 
-        The object stands on a stable face and is tilted about an edge of this face. To choose the face and the edge,
+        The object is held on an edge of a stable face, from which it is tilted. To choose the face and the edge,
         the method draws `tries` random edges of stable faces. An edge is suitable if the object balances on it at a
         tilt of 15 to 45 degrees. The method takes the suitable edge at which the balancing object has the lowest centre
         of mass. If no drawn edge is suitable, for example for a cylinder on its side, the method takes the edge with
         the lowest centre of mass.
 
-        If the edge is suitable, the object stands on the narrower of the two faces that meet at the edge. In most
-        cases, the object then turns by less than 45 degrees if it returns to the narrower face, and by more than 45
+        If the edge is suitable, the object is tilted from the narrower of the two faces that meet at the edge. In most
+        cases, the released object turns by less than 45 degrees if it returns to the narrower face, and by more than 45
         degrees if it topples onto the wider face. The method `outcome` uses this difference.
         """
         candidates, beyond, skew, radius, angle, share = jax.random.split(key, 6)

@@ -233,5 +233,5 @@ def _check_numbers(
     length = float(np.linalg.norm(np.asarray(up, float)))
     if abs(length - 1) > 1e-3:
         raise ValueError(
-            f"`up` is {up!r} with length {length:.3g}, but it must be a unit vector: divide the vector by its length"
+            f"`up` is {up!r}, which has the length {length:.6g}, but it must have the length 1: divide it by its length"
         )

@@ -212,7 +212,7 @@ class Scenario(abc.ABC):
 
     @property
     def condition_scale(self) -> tuple[float, ...]:
-        """Typical magnitude of each number in the condition of a trajectory, in SI units.
+        """Typical magnitude of each number in a trajectory's condition, in SI units.
 
         The condition contains the numbers that `quantities` describes, such as the acceleration of the pad.
         """
@@ -220,9 +220,9 @@ class Scenario(abc.ABC):
 
     @property
     def vectors(self) -> int:
-        """Number of vectors (x, y) in the condition of a trajectory.
+        """Number of vectors (x, y) in a trajectory's condition, which describes the motion or the tilt of the pad.
 
-        The condition contains the numbers that `quantities` describes. The vectors come first, before the scalars.
+        The property `quantities` lists the vectors and the scalars of the condition. The vectors come first.
         """
         return sum(quantity.vector for quantity in self.quantities)
 
@@ -300,7 +300,7 @@ class Scenario(abc.ABC):
             )
         if not 0 <= self.tilt <= math.pi:
             raise ValueError(
-                f"scenario.tilt is {self.tilt} rad, but it must be from 0 to pi (give degrees as math.radians(30))"
+                f"scenario.tilt is {self.tilt} rad, but it must be from 0 to pi (30 degrees are math.radians(30))"
             )
 
 

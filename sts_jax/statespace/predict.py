@@ -90,7 +90,7 @@ def sample(
 
 
 class Drawn(NamedTuple):
-    """Samples: k final poses for each of n items, and the parts of the final images that the object changes.
+    """Samples for n trajectories: k final poses of each object, and the parts of the final images that depend on it.
 
     These parts are called layers. They are the outlines and colours of the objects, and the changes that the objects
     cause in the tactile images. `compose` combines them with the images of the empty sensor, and returns complete

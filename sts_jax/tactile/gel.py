@@ -95,7 +95,8 @@ def indent(gel: Gel, heights: Float[Array, "r c"]) -> Equilibrium:
         heights: Heights of the object's underside above the gel's face (m), `inf` where there is no object.
 
     Returns:
-        The `Equilibrium`, with `sink` and `turn` equal to 0. `balanced` is True, because no wrench was given.
+        The `Equilibrium`, with `sink` and `turn` equal to 0. `balanced` is always True, because this function
+        does not look for a pose in which the pressure balances a load.
     """
     pressure = gel.stiffness * jnp.clip(-heights, 0, gel.thickness)
     return Equilibrium(jnp.float32(0), jnp.zeros(2), pressure, jnp.bool_(True))
@@ -133,9 +134,9 @@ def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) ->
     Returns:
         The equilibrium. If `Fz <= 0`, there is no motion and no pressure, and `balanced` is True. If no equilibrium
         exists within the limits of depth (`Gel.max_depth`) and tilt (`Gel.max_tilt`), the result lies within these
-        limits and `balanced` is False. This happens if the object's lowest point is more than `Gel.max_depth` above
-        the gel, if the centre of pressure of the wrench lies outside the object's footprint or outside the pad, or if
-        the load needs more depth or tilt than the limits allow.
+        limits and `balanced` is False. This happens if the object's lowest point in the given pose is higher than
+        `Gel.max_depth` above the gel's face, if the centre of pressure of the wrench lies outside the object's
+        footprint or outside the pad, or if the load needs more depth or tilt than the limits allow.
     """
     force = wrench[2]
     pressed = force > 0

@@ -157,9 +157,11 @@ def _check_condition(expected: int, arrays: Arrays) -> None:
     """Raise a ValueError if the condition of the training set has another width than the model needs."""
     width = 0 if arrays.condition is None else arrays.condition.shape[1]
     if width != expected:
+        found = "None" if arrays.condition is None else f"an array of width {width}"
+        needed = f"an array of width {expected}" if expected else "None"
         raise ValueError(
-            f"`condition` has width {width}, but the model needs width {expected}: give "
-            f"{f'a condition of width {expected}' if expected else 'condition=None'}, or a model with condition={width}"
+            f"`condition` is {found}, but it must be {needed} for a model with condition={expected}: change the data, "
+            f"or make a model with condition={width}"
         )
 
 

@@ -1,4 +1,4 @@
-"""Trained models, and their loading from a folder without the optimiser."""
+"""Trained models, and functions that load them from a folder. The state of the optimiser is not read."""
 
 import os
 from pathlib import Path

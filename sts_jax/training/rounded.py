@@ -54,7 +54,7 @@ def read(path: Path) -> dict[str, np.ndarray]:
         path: File to read.
 
     Returns:
-        Arrays by name. Rounded arrays are float32.
+        Arrays by name. The arrays that `write` rounded before it stored them are returned as float32.
 
     Raises:
         Exception: The file is damaged. The type depends on the damage (errors of zipfile, zlib or NumPy).

@@ -271,7 +271,8 @@ class ObjectScene(Scene):
     def ends(self, seen: Seen, blender: Blender) -> Ends:
         """Return the image with the LEDs off and the image with the LEDs at full power, see `Scene.ends`.
 
-        The images show the scene in the state `seen`. The images of each pose are rendered only once.
+        The images show the object in the pose that the argument `seen` contains, or the empty pad. The images of each
+        pose are rendered only once.
         """
         if seen.phase is Phase.EMPTY:
             return self._render(-1, 0, blender)
