@@ -1,6 +1,6 @@
 """Errors of a plain network that predicts a single final state, for comparison with the state-space model.
 
-    python -m benchmarks.deterministic runs/freefall  # a run of --preset default, about 9 minutes on two CPU cores
+    python -m benchmarks.deterministic runs/freefall  # takes about 9 minutes on two CPU cores with the default preset
     python -m benchmarks.deterministic runs/perturbed --scenario perturbed --seconds 480
 
 Trains a convolutional network without latent variables on the dataset of a run. The inputs of the network are the

@@ -6,9 +6,10 @@
 
 `--real` is a folder of trajectories that `experiments.real collect` recorded with a sensor. `--simulated` is a folder
 that `experiments.real collect --twin` recorded with the digital twin, a simulated sensor. It may also be the dataset of
-an experiment that was run with `--collection.no-crop`. Raw images are rectified with the lens of the
-sensor file. By default, a real and a simulated trajectory with the same number must show the same object in the same
-poses. Give `--match none` if the two folders show the same object in different poses.
+an experiment that was run with `--collection.no-crop`. `--sensor` and `--simulated-sensor` are the sensor files of the
+real sensor and of the digital twin. Raw images are rectified with the calibration of the lens in these files. By
+default, a real and a simulated trajectory with the same number must show the same object in the same poses. Give
+`--match none` if the two folders show the same object in different poses.
 
 The command prints differences per pixel, the distance between the distributions of real and simulated images in a
 feature space, and the accuracy of a classifier that tries to distinguish real from simulated images. The command

@@ -51,7 +51,7 @@ def look(config: Config, sensor: sts.Sensor, body: sts.objects.Body) -> tuple[st
 
     Returns:
         A tuple `(frame, between, text)`. `frame` has all outputs of the sensor. `between` is a further image, with the
-        LEDs at `config.light` times full power. `text` is a description of three lines.
+        LEDs at `config.light` times full power. `text` describes the pose, the imprint and the speed.
     """
     pose, wrench, words = lay(config, sensor, body)
     given = sensor, body, jnp.asarray(pose, jnp.float32), jnp.asarray(wrench, jnp.float32)

@@ -179,7 +179,7 @@ def test_a_full_disk_loses_nothing_and_is_reported_before_the_next_trajectory(tm
         session.confirm(number)
         until(lambda: session.problem is not None)
         assert session.confirmed == 1
-        with pytest.raises(SessionError, match=r"No space left.*changes that are not on disk yet: 3"):
+        with pytest.raises(SessionError, match=r"changes that are not on disk yet: 3\. Error: .*No space left"):
             session.check_ready()
         with pytest.raises(SessionError, match=r"were not on disk after 0\.1 s.*: the initial pair of trajectory 1"):
             session.flush(0.1)

@@ -63,8 +63,8 @@ def evaluate(
 
     Raises:
         ValueError: The names of `own.measurements` differ from the names of the measurements with which the main model
-            was trained. The main model is the only trained model in the main table. A measurement is a modality besides
-            images and pose, such as the contact force.
+            was trained. The main model is the model in `table.md`. `table-full.md` also contains the other trained
+            models. A measurement is a modality besides images and pose, such as the contact force.
     """
     suffix = "" if split == config.splits[0] else f"-by-{split}"
     done, figures = workdir / f"metrics{suffix}.json", workdir / f"figures{suffix}"

@@ -75,7 +75,7 @@ class Terminal:
 
 @contextlib.contextmanager
 def single_keys() -> Iterator[None]:
-    """Let the terminal pass on each key without waiting for Enter, and restore its mode afterwards.
+    """Let the program read each key immediately, without waiting for Enter, as long as the `with` block runs.
 
     Raises:
         ValueError: The terminals of this system cannot be read key by key.

@@ -323,8 +323,8 @@ class Dataset:
         if without.size:
             raise ValueError(
                 f"`trajectories` contains {without[0]}, which has no images: use `ends`, which needs no images, or "
-                "take indices from `members` or `rendered`. The number of trajectories with images of each object is "
-                f"num_rendered={self.collection['num_rendered']} in this dataset."
+                "take indices from `members` or `rendered`. In this dataset, each object has images for "
+                f"{self.collection['num_rendered']} of its trajectories (num_rendered)."
             )
         last = self.trajectory["pose"].shape[1] - 1
         kinds = np.unique(self.frames[:, 2]).tolist() if symmetries else [0]

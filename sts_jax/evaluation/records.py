@@ -1,4 +1,4 @@
-"""The types of an evaluation. `Scores` holds the errors of a predictor. `Metric` computes one number from them.
+"""Classes for evaluations. `Scores` holds the errors of a predictor. `Metric` computes one number from them.
 
 An item is one held-out trajectory. n is the number of items.
 """

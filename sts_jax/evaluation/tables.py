@@ -24,7 +24,7 @@ def table(
         columns: The columns of metrics, from left to right.
 
     Returns:
-        The text, with an explanation of the metrics above the table.
+        The text. It consists of the title, an explanation of the metrics, the table and the notes.
 
     Raises:
         ValueError: The summary lacks the metric of a column.

@@ -200,10 +200,11 @@ class ProvenFrames:
     def shot(self, stream: Stream, deadline: float, *, after_s: float = 0.0, then: Stream | None = None) -> Shot:
         """Take an image of one stream.
 
-        After the frame has arrived, a request is sent to the controller. The controller's answer must confirm that the
-        lights did not change between the switch to `stream` and this request. If `stream` is "visual" and `then` is
-        "tactile", the request itself switches the lights on. In all other cases, the request does not change the
-        lights. If `stream` is "tactile" and `then` is "visual", a second request switches the lights off.
+        If the lights are not set for `stream`, they are switched first. After the frame has arrived, a request is sent
+        to the controller. The controller's answer must confirm that the lights did not change until this request. If
+        `stream` is "visual" and `then` is "tactile", the request itself switches the lights on. In all other cases, the
+        request does not change the lights. If `stream` is "tactile" and `then` is "visual", a second request switches
+        the lights off.
 
         Args:
             stream: Stream of the image, "visual" (lights off) or "tactile" (lights on).

@@ -72,7 +72,7 @@ class Entry(NamedTuple):
 
 
 class Images(NamedTuple):
-    """RGB images of all confirmed trajectories. Each field is one array, ordered by the numbers of the trajectories."""
+    """RGB images of all trajectories that a user confirmed, ordered by the numbers of the trajectories."""
 
     initial_visual: UInt8[np.ndarray, "n height width 3"]
     initial_tactile: UInt8[np.ndarray, "n height width 3"]

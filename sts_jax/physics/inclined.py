@@ -77,8 +77,8 @@ class Inclined(Scenario):
         super().check()
         if not 0 <= self.slope < math.pi / 2:
             raise ValueError(
-                f"scenario.slope is {self.slope} rad, but it must be >= 0 and < pi / 2 "
-                "(30 degrees are math.radians(30))"
+                f"scenario.slope is {self.slope} rad, but it must be >= 0 and < pi / 2. "
+                "For an angle in degrees, use math.radians"
             )
         check_length("wall", self.wall)
         check_length("across", self.across)

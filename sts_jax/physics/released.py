@@ -81,13 +81,14 @@ class Released(Scenario):
         check_length("spread", self.spread)
         if not 0 <= self.skew <= TURNED:
             raise ValueError(
-                f"scenario.skew is {self.skew} rad, but it must be from 0 to pi / 4 (4 degrees are math.radians(4))"
+                f"scenario.skew is {self.skew} rad, but it must be from 0 to pi / 4. For an angle in degrees, use "
+                "math.radians"
             )
         low, high = self.beyond
         if not -TURNED <= low <= high <= TURNED:
             raise ValueError(
                 f"scenario.beyond is {self.beyond} rad, but it must be (low, high) with -pi / 4 <= low <= high <= "
-                "pi / 4 (10 degrees are math.radians(10))"
+                "pi / 4. For an angle in degrees, use math.radians"
             )
         check_range("carried", self.carried)
         if self.carried[1] > 1:

@@ -193,8 +193,8 @@ class Scenario(abc.ABC):
     def drift(self, condition: Float[Array, "c"]) -> Float[Array, "2"]:
         """Return the velocity that an object without friction would have relative to the pad.
 
-        Figures draw this velocity as an arrow. Unless a subclass overrides this method, the result is the horizontal
-        part of `velocity`.
+        Figures draw this velocity as an arrow. Unless a subclass overrides this method, the result is the velocity on
+        release, the x and y that the method `velocity` returns.
 
         Args:
             condition: Known quantities of the trajectory in SI units, such as an acceleration, (c,). The attribute
@@ -300,7 +300,8 @@ class Scenario(abc.ABC):
             )
         if not 0 <= self.tilt <= math.pi:
             raise ValueError(
-                f"scenario.tilt is {self.tilt} rad, but it must be from 0 to pi (30 degrees are math.radians(30))"
+                f"scenario.tilt is {self.tilt} rad, but it must be from 0 to pi. For an angle in degrees, use "
+                "math.radians"
             )
 
 

@@ -134,8 +134,8 @@ def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) ->
     Returns:
         The equilibrium. If `Fz <= 0`, there is no motion and no pressure, and `balanced` is True. If no equilibrium
         exists within the limits of depth (`Gel.max_depth`) and tilt (`Gel.max_tilt`), the result lies within these
-        limits and `balanced` is False. This happens if the object's lowest point in the given pose is higher than
-        `Gel.max_depth` above the gel's face, if the centre of pressure of the wrench lies outside the object's
+        limits and `balanced` is False. This happens if the object's lowest point is too far above the gel's face in
+        the given pose (by more than `Gel.max_depth`), if the centre of pressure of the wrench lies outside the object's
         footprint or outside the pad, or if the load needs more depth or tilt than the limits allow.
     """
     force = wrench[2]

@@ -85,9 +85,9 @@ class Preprocessing:
         """Decode poses from the output of a network.
 
         Args:
-            code: Encoded poses, as from `encode_pose`. The field `rotation`, "matrix" or "quaternion", is the
-                representation of the rotations. An inexact rotation matrix is replaced by the nearest rotation matrix.
-                A quaternion is normalised. If all numbers of the rotation are 0, the identity is used.
+            code: Encoded poses, as from `encode_pose`. The field `rotation` of this `Preprocessing` states whether the
+                poses contain rotation matrices or quaternions. An inexact rotation matrix is replaced by the nearest
+                rotation matrix. A quaternion is normalised. If all numbers of the rotation are 0, the identity is used.
 
         Returns:
             Position (m) and unit quaternion (w, x, y, z) with `w >= 0` of each pose.
