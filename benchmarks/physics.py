@@ -1,4 +1,4 @@
-"""Speed of the physics: steps per second compared with C MuJoCo, falls and frames per second, and compilation.
+"""Speed of the simulation: steps, falls and frames per second of MJX and of C MuJoCo, and compilation times.
 
     python -m benchmarks.physics                   # about 2 minutes on two CPU cores
     python -m benchmarks.physics --engines 4       # about 2 minutes

@@ -182,8 +182,8 @@ def load(config: Config) -> tuple[Side, Side]:
         )
     if is_dataset and config.simulated_sensor is not None:
         raise ValueError(
-            f"--simulated-sensor is {config.simulated_sensor}, but {config.simulated} is a dataset, whose images are "
-            "rectified: leave out --simulated-sensor"
+            f"--simulated-sensor is {config.simulated_sensor}, but the option is only for raw images, and the images "
+            f"of the dataset {config.simulated} are already rectified: leave out --simulated-sensor"
         )
     if config.resolution is not None and min(config.resolution) < gap.LEAST_SIDE:
         raise ValueError(

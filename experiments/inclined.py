@@ -1,4 +1,4 @@
-"""Predict from the first frame the images and the pose at rest of objects that are released on a tilted pad.
+"""Predict the final images and the final pose of objects that are released on a tilted pad.
 
     python -m experiments.inclined                    # 10 to 30 minutes on two CPU cores
     python -m experiments.inclined --preset long      # at most 150 minutes, can be stopped and started again

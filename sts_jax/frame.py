@@ -72,8 +72,8 @@ def sense(
 
     With a wrench, the object sinks and tilts until the gel balances Fz, Mx and My (`tactile.settle`), and the images
     show the object in this balanced pose. Without a wrench, the object stays in the given pose. The gel's outer face
-    is the plane z = 0 of the sensor frame. If no part of the object is above this plane, the images show an empty
-    sensor.
+    is the plane z = 0 of the sensor frame, and the camera is at z < 0. If the whole object is at z < 0, inside the
+    sensor, the images show an empty sensor.
 
     In each of the following cases, the images also show an empty sensor, and `Frame.balanced` is False:
 

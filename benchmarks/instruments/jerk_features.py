@@ -21,7 +21,7 @@ class Sight(NamedTuple):
     """Properties computed from the shapes of objects.
 
     The field `rigid` has the mass properties of each object at 17 fill levels of its interior, from empty to full. The
-    first axis of each of the three fields is the axis of the objects.
+    first index of each array is the number of the object.
     """
 
     profile: np.ndarray  # (b, 10) m: radius of the base, height, greatest radius, radii at seven heights
@@ -62,8 +62,8 @@ def weighed(starts: Starts) -> np.ndarray:
 def canonical(pose: np.ndarray, condition: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rotate or mirror each trajectory's start by a symmetry of the pad, so that the push is 0 to 45 degrees from +x.
 
-    The start is the position of the object in the first frame, and the push. The push is the acceleration of the object
-    in the frame of the pad, opposite to the acceleration of the pad.
+    A start consists of the object's position in the first frame and of the push. The push is the acceleration of the
+    object in the frame of the pad, opposite to the acceleration of the pad.
 
     Args:
         pose: Poses in the first frame, `(n, 7)`.

@@ -125,8 +125,8 @@ def lens(config: Simulated, sensor: sts.Sensor) -> hardware.Lens:
 def started(config: Simulated, first: int) -> Iterator[twin.Twin]:
     """Start a twin, which is a simulated sensor, and close it at the end of the `with` block.
 
-    The twin simulates a fixed sequence of trajectories for each seed. Its next trajectory is number `first` of this
-    sequence.
+    The trajectories of a twin are numbered from 0, and their motions depend only on the number and on the seed. This
+    twin begins with the trajectory number `first`.
     """
     sensor, resolution = sts.Sensor(), config.size[::-1]
     scene = twin.ObjectScene(

@@ -198,7 +198,7 @@ class Camera:
             FrozenCameraError: The camera has sent the same image for longer than `CameraConfig.frozen_after_s`.
             FrameSizeError: The size of the camera's frames has changed.
             EndOfVideoError: The video file has ended.
-            CameraNotConnectedError: The camera is not connected, or was disconnected during the call.
+            CameraNotConnectedError: `connect` was not called, or `disconnect` was called before the frame arrived.
             ValueError: `timeout_ms` is not positive.
         """
         return self._connected().wait(self._timeout_s(timeout_ms), exposed_now=self.config.kind != "file")

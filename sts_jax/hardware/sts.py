@@ -283,8 +283,9 @@ class STS:
         """Take one image of the visual stream and one image of the tactile stream.
 
         Both frames arrive after the start of the call. However, the exposure of the first frame may begin before the
-        call, but not earlier than the settling time of the lights (`settling`) before it. The first image belongs to
-        the stream for which the lights are already set, so the lights are switched only once for a pair.
+        call. The time from this beginning to the call is at most the settling time of the lights (`settling`). The
+        first image belongs to the stream for which the lights are already set, so the lights are switched only once for
+        a pair.
 
         Args:
             timeout_ms: Longest wait for the pair (ms). None: two times the sensor's `timeout_s`. If the LED controller

@@ -50,7 +50,7 @@ def path_of(library: Library, item: Item) -> Path:
 
 
 def write(path: Path, entry: Entry) -> None:
-    """Write the loaded body of an item to a cache file. An interruption leaves no incomplete file."""
+    """Write the body of a library item to a cache file. An interruption leaves no incomplete file."""
     about = json.dumps({"gaps": entry.gaps, "notes": entry.notes})
     leaves: dict[str, Any] = {field.name: getattr(entry.body, field.name) for field in dataclasses.fields(Body)}
     write_arrays(path, {"about": np.frombuffer(about.encode(), np.uint8), **leaves})

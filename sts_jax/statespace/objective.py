@@ -4,8 +4,8 @@ A batch has the first and the last frames of some trajectories. The inputs are f
 are the true state in the first frame, and the images, the pose and the outcome of the last frame. The state code is a
 vector that describes the pose, the shape and the mass of the object. The appearance code describes all other visible
 properties. Each input gives a Gaussian estimate of both codes. `fuse` multiplies the estimates from some of the inputs.
-The product is a Gaussian over both codes, which is called the belief from these inputs. The loss is the weighted sum of
-these terms. NLL is a negative log likelihood.
+The product is a Gaussian over both codes, which is called the belief from these inputs. NLL is a
+negative log likelihood. The loss is the weighted sum of these terms:
 
 - `state` and `doubt`: the squared error of the state code that each encoder estimates, and the NLL by which the encoder
   learns the variance of this error

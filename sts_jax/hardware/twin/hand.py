@@ -82,7 +82,7 @@ class Hand(AutomaticPerson):
             )
 
     def action(self) -> Action | None:
-        """Return the next action of the person. `hardware.collect` calls this method.
+        """Return the action that a person would take next. `hardware.collect` calls this method.
 
         Returns:
             `Action.CONFIRM` if a trajectory waits for its review, or if the object has not moved in the 3 s after its
