@@ -13,8 +13,8 @@ object is held or released after every ten pairs.
 The lag of a camera is the time from the end of a frame's exposure to the sending of the frame. The emulated camera has
 several lags in turn, and `hardware.STS` reads an equal share of the pairs at each lag. At each lag, `hardware.STS` also
 measures its settling times, from a switch of the light to the first frame that shows only the new light. The emulated
-camera logs the light during each exposure. An image counts as one of a wrong or mixed light if, in this log, the mean
-light of its exposure differs from the requested light by more than 0.1 % of the full light.
+camera logs the light during each exposure. The light of an image counts as wrong or
+mixed if, in this log, the mean light of its exposure differs from the requested light by more than 0.1 % of full light.
 
 The camera needs at least two frame periods and one settling time per pair, which limits the rate. The order of the two
 images alternates from pair to pair, so the light is switched only once per pair: on in one pair, and off in the next

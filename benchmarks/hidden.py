@@ -20,9 +20,10 @@ object starts on a tilted pad or just above it. The parts are:
   input: the weight on the jerked pad, or the centre of pressure on the slope.
 - `pictures`: as `truth`, but a small network estimates the measurement of touch from the first uint8 tactile image. The
   network is trained on other objects.
-- `fill`: the AUC of a small network that separates objects that are more than half full from emptier objects. The
-  inputs of the network are visual images of objects in the air, the same images with a tint on the fuller objects, or
-  tactile images. This part exists for the jerked pad only, because its objects are standing bottles.
+- `fill`: the AUCs of three small networks that separate objects that are more than half full from emptier objects. The
+  first network sees tactile images of the standing objects. The second network sees visual images of the objects in the
+  air. The third network sees the same visual images, but with a tint on the fuller objects. Its AUC shows whether such
+  a network detects a visible difference. This part exists for the jerked pad only.
 
 Cross-validation folds and bootstrap samples (for 95 % intervals) contain all starts of an object or none. The starts
 are simulated with the defaults of the scenario. All results are printed. The features of the classifiers are in
@@ -291,7 +292,7 @@ def fill(learned: Lesson, items: list[objects.Body], starts: Starts, num: int, s
         learned: Training data, and the tactile images under study.
         items: The objects under study.
         starts: Initial states of the objects' trajectories, in the order of the tactile images under study.
-        num: Number of falls of each object under study.
+        num: Number of visual images of each object under study.
         steps: Training steps of the networks.
     """
     detect("touch, standing", learned.examples, learned.starts, learned.tactile, starts, steps)

@@ -277,12 +277,15 @@ def last_in_c(case: Case, traj: physics.Trajectory, *, every_vertex: bool = Fals
 
 
 def named(case: Case, first: Array | np.ndarray, last: Array | np.ndarray) -> np.ndarray:
-    """Return the index of each run's label in `case.labels`, `(n,)`. The label names the state at the end of the run.
+    """Label the runs of a case. The label of a run names the state at its end.
 
     Args:
         case: The case of the runs.
         first: Pose at the start of each run, `(n, 7)`.
         last: Pose at the end of each run, `(n, 7)`.
+
+    Returns:
+        Index in `case.labels` for each run, `(n,)`.
     """
     return np.asarray(jax.vmap(case.label)(jnp.asarray(first), jnp.asarray(last)))
 

@@ -109,7 +109,7 @@ def predictor(size: int) -> Callable[[], None]:
 def state_stepper(size: int) -> Callable[[], None]:
     """Make a function that runs one compiled training step of a state-space model on random data.
 
-    The model has the default configuration, with the outcomes of the scenario `freefall`.
+    The model has the default configuration.
 
     Args:
         size: Batch size.

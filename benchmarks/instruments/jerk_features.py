@@ -55,7 +55,7 @@ def sight(items: list[objects.Body]) -> Sight:
 
 
 def weighed(starts: Starts) -> np.ndarray:
-    """Logarithm of the true masses in kg, `(n, 1)`. Tactile images of standing objects show approximately this."""
+    """Logarithm of the true masses in kg, `(n, 1)`. Tactile images of standing objects reveal approximate masses."""
     return np.log(starts.mass)[:, None]
 
 

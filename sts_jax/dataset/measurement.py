@@ -68,14 +68,14 @@ class Measurement:
 def measured(
     measurements: Sequence[Measurement], data: Any, trajectories: np.ndarray, symmetries: Sequence[int]
 ) -> dict[str, np.ndarray]:
-    """Measure the first and last frames of some trajectories, and of their turned and mirrored copies.
+    """Measure the first and last frames of trajectories that can also be turned and mirrored.
 
     Args:
         measurements: The specifications of the modalities.
         data: The dataset, a `Dataset`.
         trajectories: Indices of n trajectories, int `(n,)`.
-        symmetries: The k copies of each trajectory, given as indices of the symmetries of `dataset.symmetry` that
-            produce them. The symmetry with index 0 produces the trajectory itself.
+        symmetries: Indices of k symmetries (`dataset.symmetry`). Each trajectory is turned or mirrored by each of these
+            symmetries, which gives k copies. The symmetry with index 0 leaves the trajectory unchanged.
 
     Returns:
         The values of each modality by name, uint8 or float32 `(n * k, 2, *shape)`. The k copies of a trajectory are

@@ -256,7 +256,7 @@ def shade(
     3. Haze: the share `t = exp(-height / haze)` of the remaining light is transmitted and multiplied by `tint`. The
        share `1 - t` of the background `empty` is added.
     4. Milky skin: the share `1 - milk` of the result is transmitted. The skin adds `milk * (1 - hidden)` times the
-       light of a background on which the object casts no shadow.
+       light that the camera would receive at the same pixels without the object.
 
     Args:
         room: Constants of the external light.

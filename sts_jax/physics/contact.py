@@ -247,9 +247,9 @@ def collide(
 ) -> Contacts:
     """Find the contacts between an object and a box. The top of the box is centred at the origin.
 
-    There is a candidate for each vertex of the object inside the box, for each crossing of an edge of the object with
-    one of the four edges of the top, and for each corner of the top inside the object. A candidate can become a contact
-    if its depth is above 0 and above the largest depth minus 1 mm (`SKIN`).
+    There is a candidate for each vertex of the object inside the box, for each edge of the object that enters the box
+    through the top and leaves it through a side, and for each corner of the top inside the object. A candidate can
+    become a contact if its depth is above 0 and above the largest depth minus 1 mm (`SKIN`).
 
     The first contact is the deepest candidate. The second contact is the deepest of the candidates that are more than
     1 mm (`APART`) away from the first contact. For each of `num` - 2 evenly spaced directions, the candidate with the

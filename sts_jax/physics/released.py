@@ -104,11 +104,11 @@ class Released(Scenario):
 
         See `Scenario.start` for the arguments.
 
-        The object is held on an edge of a stable face, from which it is tilted. To choose the face and the edge,
-        the method draws `tries` random edges of stable faces. An edge is suitable if the object balances on it at a
-        tilt of 15 to 45 degrees. The method takes the suitable edge at which the balancing object has the lowest centre
-        of mass. If no drawn edge is suitable, for example for a cylinder on its side, the method takes the edge with
-        the lowest centre of mass.
+        The object is held on an edge of one of its stable faces. The tilt is the angle between this face and the
+        horizontal. To choose the face and the edge, the method draws `tries` random edges of stable faces. An edge is
+        suitable if the object balances on it at a tilt of 15 to 45 degrees. The method takes the suitable edge at which
+        the balancing object has the lowest centre of mass. If no drawn edge is suitable, for example for a cylinder on
+        its side, the method takes the edge with the lowest centre of mass.
 
         If the edge is suitable, the object is tilted from the narrower of the two faces that meet at the edge. In most
         cases, the released object turns by less than 45 degrees if it returns to the narrower face, and by more than 45

@@ -76,8 +76,8 @@ class Config:
         if self.condition < 0 or (self.condition and not 0 <= 2 * self.vectors <= self.condition):
             raise ValueError(
                 f"condition is {self.condition} and vectors is {self.vectors}, but they must satisfy condition >= "
-                "2 * vectors >= 0. Set condition to the number of values in the scenario's condition, and vectors to "
-                "the number of two-dimensional vectors at the start of these values"
+                "2 * vectors >= 0. Set condition to len(scenario.condition_scale), the number of known quantities of "
+                "a trajectory, and vectors to scenario.vectors"
             )
         if self.traits < TINT:
             raise ValueError(

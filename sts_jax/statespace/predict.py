@@ -90,17 +90,17 @@ def sample(
 
 
 class Drawn(NamedTuple):
-    """Samples for n trajectories: k final poses of each object, and the parts of the final images that depend on it.
+    """Samples for n trajectories: k final poses for each of them, and layers for some of these poses.
 
-    These parts are called layers. They are the outlines and colours of the objects, and the changes that the objects
-    cause in the tactile images. `compose` combines them with the images of the empty sensor, and returns complete
-    images. Only the poses with index 0 to `drawn` - 1 have layers. `drawn` is an argument of `draw`.
+    The layers are the outlines and colours of the objects, and the changes that the objects cause in the tactile
+    images. `compose` combines them with the images of the empty sensor, and returns complete images. For each
+    trajectory, only the first poses have layers. The argument `drawn` of `draw` is the number of these poses.
     """
 
     belief: Gaussian  # posterior of the state code and the appearance code of the first frame, (n, code + look)
     outcome: Float[Array, "n outcomes"]  # probability of each outcome
     pose: Float[Array, "k n 12"]  # pose codes of the last frame
-    layers: Layers  # outlines and colours, drawn * n, with the axis of the items last
+    layers: Layers  # outlines and colours, drawn * n, with the axis of the trajectories last
     level: Float[Array, "m"]  # threshold of each outline, drawn * n
     empty: dict[str, Float[Array, "size size 3"]]  # images of the empty sensor with the size of the layers
 
@@ -117,7 +117,7 @@ def draw(
     num: int,
     drawn: int,
 ) -> Drawn:
-    """Sample final poses, and render layers for the first `drawn` poses of each item.
+    """Sample `num` final poses for each trajectory, and render the layers of the first `drawn` of these poses.
 
     The layers are the outlines and colours of the objects, and the changes that the objects cause in the tactile
     images. `compose` combines them with the images of the empty sensor, and returns complete images. The arguments

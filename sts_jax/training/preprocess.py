@@ -117,7 +117,8 @@ class Preprocessing:
 
         Args:
             name: Name of the modality.
-            values: Poses, images in [0, 1], or the numbers of a further modality from `dataset.Measurement` (SI units).
+            values: Poses, images in [0, 1], or the values of a further modality (SI units). A further modality is
+                defined by a `dataset.Measurement`.
 
         Returns:
             The result of `encode_pose` for the modality `pose`. The numbers of a further modality are divided by its

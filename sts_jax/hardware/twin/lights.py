@@ -28,7 +28,8 @@ class _Change(NamedTuple):
 class LightHistory:
     """The brightness of the LEDs over time, as a share of their full power.
 
-    After a change of the levels at time t0, the share approaches its new value exponentially:
+    The levels are the settings of the four LEDs, from 0 to 255. If the levels are changed at time t0, the share
+    approaches its new value exponentially:
 
         s(t) = a + (s0 - a) exp(-(t - t0) / tau)
 
@@ -52,7 +53,7 @@ class LightHistory:
         self._changes = [_Change(-math.inf, 0.0, 0.0)]
 
     def set(self, time_s: float, levels: protocol.Levels) -> None:
-        """Record a change of the LED levels. A change that keeps the mean of the four levels has no effect.
+        """Record a change of the LED levels. The call is ignored if the mean of the four levels stays the same.
 
         Args:
             time_s: Time of the change (s), not earlier than the time of the last change.

@@ -1,4 +1,4 @@
-"""The scene of a `Twin` (a simulated sensor): an empty pad, or an object that is held, moves and lies still."""
+"""The scene of a `Twin` (a simulated sensor): an empty pad, or an object that is held, moving or at rest."""
 
 import abc
 import bisect
@@ -271,8 +271,8 @@ class ObjectScene(Scene):
     def ends(self, seen: Seen, blender: Blender) -> Ends:
         """Return the image with the LEDs off and the image with the LEDs at full power, see `Scene.ends`.
 
-        The images show the object in the pose that the argument `seen` contains, or the empty pad. The images of each
-        pose are rendered only once.
+        If the argument `seen` contains a pose, the images show the object in this pose. Otherwise, they show the empty
+        pad. The images of each pose are rendered only once.
         """
         if seen.phase is Phase.EMPTY:
             return self._render(-1, 0, blender)
