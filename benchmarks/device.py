@@ -177,7 +177,7 @@ def report(found: list[Measured]) -> str:
 
 
 def measure_all(args: Args) -> list[Measured]:
-    """Read an equal share of the image pairs at each lag in `args.lags_ms`, and return one result per lag.
+    """Read `args.pairs` pairs of images in equal parts at the lags in `args.lags_ms`. Return one result per lag.
 
     The lag is the time from the end of an exposure to the sending of the frame by the emulated camera.
     """

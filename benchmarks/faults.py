@@ -13,7 +13,7 @@ moment of a read. Reads continue until a pair has been read after the end of the
 The emulated camera logs the light during each exposure. The program counts a received image as wrong if the log shows a
 wrong or mixed light for its exposure, or if the log has no such exposure. The settling time of the lights
 is the time from a switch to the first frame that shows only the new lights. An image is counted as old if the time from
-the beginning of its exposure to the read was longer than the settling time.
+the beginning of its exposure to the beginning of the read was longer than the settling time.
 
 In the last kind of fault, a second process reads the pairs, and the second process is killed while a light is on.
 """

@@ -83,7 +83,7 @@ def rates() -> None:
 
 
 def main(args: Args) -> None:
-    """Print how long a new user waits for each first step, and how many frames and gradients are computed per second.
+    """Print how long a new user waits for the first results, and how many frames and gradients are computed per second.
 
     The option `--vmap` leaves out the waiting times.
     """

@@ -230,13 +230,11 @@ class Difference:
 
 
 def levels(field: str, values: tuple[Any, ...]) -> list[Difference]:
-    """Make a list of changes to apply to clean images. All of them change the same imperfection of the camera.
-
-    Clean images are images of a digital twin that has almost no imperfections.
+    """Make a list of imperfect cameras, which differ from an almost perfect camera in a single imperfection.
 
     Args:
         field: Field of `twin.Imperfections`, such as "vignetting". The other fields are as in `CLEAN`.
-        values: Values of the field, one for each change.
+        values: Values of the field, one for each camera.
     """
     return [Difference(f"{field} {value:g}", dataclasses.replace(CLEAN, **{field: value})) for value in values]
 

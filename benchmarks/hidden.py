@@ -139,8 +139,8 @@ def outcomes(study: Study, starts: Starts) -> None:
 
     A start is the initial state of a trajectory. The outcome is how the trajectory ends, such as by toppling. A start
     is unsettled if its object lies on the pad at the end of the trajectory but has not come to rest. For the last
-    share, trajectories were simulated again from the same start with other random contents of the object: another fill
-    level and, in the scenario `inclined`, contents that lie on another side of the object.
+    share, each trajectory was simulated again from the same start, but with other random contents of the object. The
+    new contents have another fill level and, in the scenario `inclined`, another place inside the object.
     """
     share = functools.partial(classifier.interval, classifier.mean, groups=starts.body)
     for outcome in study.scenario.outcomes:
@@ -219,10 +219,10 @@ def lesson(study: Study, items: list[objects.Body], starts: Starts, others: int)
 
 
 def pictures(study: Study, learned: Lesson, starts: Starts, steps: int) -> np.ndarray:
-    """Train a network on tactile images, and return its estimates of the quantity that touch measures.
+    """Train a network on tactile images, and return its estimates of the mass or of the centre of pressure.
 
-    In the scenario of the jerked pad, this quantity is the logarithm of the mass. In the scenario of the slope, it is
-    the centre of pressure.
+    The network estimates the logarithm of the mass in the scenario of the jerked pad, and the centre of pressure in the
+    scenario of the slope.
 
     Args:
         study: Settings of the scenario.

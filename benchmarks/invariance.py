@@ -1,4 +1,4 @@
-"""Test whether half the time step, a mirrored scene or C MuJoCo changes how often each rest pose or outcome occurs.
+"""Test whether a shorter time step, a mirrored scene or C MuJoCo changes how often each rest pose or outcome occurs.
 
     python -m benchmarks.invariance             # about 50 minutes on two idle cores
     python -m benchmarks.invariance --num 300   # about 5 minutes

@@ -208,7 +208,7 @@ def grouped(models: list, states: np.ndarray) -> list[tuple[list, np.ndarray]]:
 
 
 def worlds(count: int, frames: int) -> tuple[Worlds, mjx.Model, mjx.Data]:
-    """Make the arguments that `simulate` passes to MJX, for a rod (`rod`) that drops from a height of 2 mm.
+    """Make the arguments that `simulate` passes to MJX. The scene is a rod that drops from a height of 2 mm.
 
     Args:
         count: Number of worlds, which are trajectories that MJX simulates in parallel. The first 256 worlds have

@@ -40,8 +40,7 @@ def main(args: Args) -> str:
     """Draw predicted images (A to J) and true images (1 to 10) in one picture, and return the correct pairs as text.
 
     Raises:
-        ValueError: The option `--first`, the index of the first of the ten trajectories in the list of held-out
-            trajectories, is negative or too large.
+        ValueError: The option `--first` is negative, or it is too large for the number of held-out trajectories.
     """
     if args.first < 0:
         raise ValueError(f"--first must be at least 0, got {args.first}")

@@ -159,9 +159,8 @@ def _predictor(args: Args, scenario: physics.Scenario) -> sts.Predictor:
         raise ValueError(f"--trained {args.trained} is not a state-space model: give the folder of a state-space model")
     if (config.outcomes, config.condition) != (outcomes, known):
         raise ValueError(
-            f"the model in --trained {args.trained} has {config.outcomes} outcomes and a condition vector of length "
-            f"{config.condition}, but the experiment {args.model} has {outcomes} outcomes and a condition vector of "
-            f"length {known} (the known quantities of a trajectory, such as the acceleration of the pad): give a model "
+            f"the model in --trained {args.trained} has outcomes={config.outcomes} and condition={config.condition}, "
+            f"but a model of the experiment {args.model} has outcomes={outcomes} and condition={known}: give a model "
             "that this experiment trained"
         )
     return predictor

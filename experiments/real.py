@@ -15,7 +15,7 @@
 The default sub-command is `train`. This sub-command trains three models on the trajectories in `WORKDIR/dataset`. The
 models are called "VAE visual", "VAE tactile" and "MVAE without pose". The models learn to predict the images of the
 object at rest from the images of the held object. Results go to `WORKDIR/table2`. With `--preset paper`, the
-sub-command prints the expected seconds of each stage before the first stage, unless there are results already. A work
+sub-command first prints the expected seconds of each stage, unless there are results already. A work
 directory cannot contain trajectories of both a device and the twin, so give the twin a separate `--workdir`.
 
 `--sensor` is the sensor file of `experiments.commission`. The sensor file contains the calibration of the lens, and

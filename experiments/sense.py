@@ -75,7 +75,7 @@ def look(config: Config, sensor: sts.Sensor, body: sts.objects.Body) -> tuple[st
 def panels(frame: sts.Frame, between: np.ndarray, light: float) -> list[tuple[str, np.ndarray]]:
     """Return a list of images in [0, 1] with their captions.
 
-    The images are the visual image, the image `between`, the tactile image, the depth, the segmentation and the
+    The images are the visual image, the image with dimmed LEDs, the tactile image, the depth, the segmentation and the
     pressure on the gel. In the depth image, near points are bright. The pressure image has the resolution of the gel's
     grid.
 

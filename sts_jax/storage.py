@@ -1,4 +1,4 @@
-"""Atomic writing of files and folders, reading with errors that name the remedy, checksums, and locks on folders."""
+"""Atomic writing of files and folders, reading of files with helpful errors, checksums, and locks on folders."""
 
 import contextlib
 import errno

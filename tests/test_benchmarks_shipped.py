@@ -33,7 +33,7 @@ def test_too_few_objects_are_refused(tmp_path):
 
 def test_a_model_of_another_scenario_is_refused(tmp_path):
     other = Path(sts_jax.__file__).parent / "models" / "perturbed"
-    with pytest.raises(ValueError, match=r"--trained .*perturbed has 4 outcomes and a condition vector of length 3"):
+    with pytest.raises(ValueError, match=r"--trained .*perturbed has outcomes=4 and condition=3"):
         shipped.main(shipped.Args("freefall", trained=other, workdir=tmp_path / "work"))
     with pytest.raises(FileNotFoundError, match="nothing"):
         shipped.main(shipped.Args("freefall", trained=tmp_path / "nothing", workdir=tmp_path / "work"))

@@ -22,7 +22,7 @@ def claim(folder: Path, name: str, size: int) -> None:
     """Write a JSON file with the simulation settings of a scenario, such as the number of trajectories per object.
 
     Raises:
-        ValueError: The folder already has such a file with other settings. The message names all settings that differ.
+        ValueError: `folder` already has such a file with other settings. The message names all settings that differ.
     """
     settings = {"scenario": repr(SCENARIOS[name]), "num": NUM, "block": size, "sunk_limit": SUNK_LIMIT}
     storage.claim(folder / f"{name}.json", settings)

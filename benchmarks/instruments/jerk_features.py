@@ -1,4 +1,4 @@
-"""Features from which a classifier predicts the outcomes of bottles on a jerked pad (`physics.Perturbed`).
+"""Features from which a classifier predicts whether a bottle on a jerked pad (`physics.Perturbed`) topples or slides.
 
 The features come from vision, and optionally from the measured mass. They are suitable for all solids of revolution.
 """
@@ -55,7 +55,7 @@ def sight(items: list[objects.Body]) -> Sight:
 
 
 def weighed(starts: Starts) -> np.ndarray:
-    """Logarithm of the true masses in kg, `(n, 1)`. Tactile images of standing objects reveal approximate masses."""
+    """Logarithm of the mass (kg) of the object in each start, `(n, 1)`."""
     return np.log(starts.mass)[:, None]
 
 

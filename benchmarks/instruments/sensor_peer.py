@@ -68,7 +68,7 @@ class Lights:
 
 
 class SeenController(EmulatedController):
-    """An emulated controller that logs its levels in `lights`, where the camera reads them."""
+    """An emulated LED controller that logs the brightness of the LEDs in `lights`, where the camera reads it."""
 
     def __init__(self, lights: Lights, **options: object):
         super().__init__(**options)  # type: ignore[arg-type]

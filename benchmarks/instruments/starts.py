@@ -155,9 +155,9 @@ def draw(items: list[objects.Body], starts: Starts) -> tuple[np.ndarray, np.ndar
 
 
 def kept(folder: Path | None, name: str, make: Callable[[], Starts]) -> Starts:
-    """Load starts from a file. If the file does not exist, make the starts and write the file.
+    """Load the initial states of trajectories from a file. If the file does not exist, make the states and write it.
 
-    A start is the initial state of a trajectory. It is stored together with the outcome of this trajectory.
+    Each initial state is stored together with the outcome of its trajectory.
 
     Args:
         folder: Folder of the file. None: make the starts and write nothing.

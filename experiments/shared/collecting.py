@@ -234,7 +234,7 @@ class AutomaticTerminal(AutomaticPerson):
 
 
 class AutomaticPage(AutomaticPerson):
-    """A program that confirms every trajectory for the user. It also shows a page, whose buttons the user can press."""
+    """A `Person` for `hardware.collect` that confirms every trajectory automatically, and shows a page with buttons."""
 
     def __init__(self, page: Page):
         super().__init__()

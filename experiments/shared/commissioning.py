@@ -178,12 +178,12 @@ def live(config: Config, sensor: hardware.STS, pinhole: hardware.Pinhole) -> har
     """Take the missing pictures of the board, and calibrate the lens from all pictures in OUT/board.
 
     Raises:
-        CalibrationError: The pictures do not determine the lens or do not cover the view of the sensor, or the raw
-            image does not contain the whole view. The view is the part of the gel's outer face that rectified images
-            show. The message explains how to replace or add pictures.
-        ValueError: A picture of an earlier run has another size or cannot be read. The error is also raised if
-            `config.every` is None and there is no keyboard, because the Enter key must then be pressed before each
-            picture.
+        CalibrationError: The pictures do not determine the lens, or they do not cover the part of the gel's outer face
+            that rectified images show, or the camera does not see this whole part. The message explains how to replace
+            or add pictures.
+        ValueError: A picture of an earlier run cannot be read, or its size differs from that of the camera's images.
+            The error is also raised if `config.every` is None and there is no keyboard, because the Enter key must then
+            be pressed before each picture.
     """
     folder, size = config.out / "board", (config.width, config.height)
     pictures = boards.Pictures.read(folder, config.board, size)

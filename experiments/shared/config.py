@@ -167,8 +167,8 @@ def check(config: Config) -> None:
         listed, nearest = ", ".join(map(str, allowed)), min(allowed, key=lambda size: abs(size - config.image_size))
         raise ValueError(
             f"image_size must be one of {listed} for collection.resolution {height} {width} and model "
-            f"{config.model!r}, got {config.image_size}: give --image-size {nearest}, or give both another "
-            "--collection.resolution and an --image-size that divides this other resolution"
+            f"{config.model!r}, got {config.image_size}: give --image-size {nearest}, or choose "
+            "another --collection.resolution and an --image-size that divides it"
         )
     if config.model == "paper" and config.steps is not None and len(config.steps) != len(names):
         raise ValueError(

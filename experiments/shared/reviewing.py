@@ -36,7 +36,9 @@ class Review:
 
 
 def review(config: Review) -> None:
-    """Restore, confirm and discard trajectories, then check the files, draw the images, or list the trajectories.
+    """Change the states of recorded trajectories. Then check their files, draw their images, or list all trajectories.
+
+    The options `--restore`, `--confirm` and `--discard` name the trajectories that get a new state.
 
     Raises:
         SystemExit: `check` is True, and a file is damaged.

@@ -25,12 +25,12 @@ def main(config: Config, workdir: Path, *, only: Stage | None = None, own: Exten
         config: Configuration of the experiment.
         workdir: Work directory for the results.
         only: Stage to run, with the results of the earlier stages in `workdir`. None: run all stages.
-        own: Your own loss, optimiser, logger, metrics and modalities.
+        own: Your own loss, optimiser, logger, metrics, modalities (field `measurements`) and notes.
 
     Raises:
         ValueError: A field of the configuration is out of range, the work directory has another configuration, or a
-            model in it was trained with another choice of loss or optimiser or with other `own.notes`. Also raised if
-            `own.measurements` is given, but `config.model` is not "paper".
+            model in it was trained with another loss or optimiser or with other notes. Also raised if
+            `own.measurements` is not empty, but `config.model` is not "paper".
         FileNotFoundError: A stage before `only` has not been run.
         LockedError: Another process works in the work directory.
     """

@@ -207,8 +207,8 @@ class Dataset:
         """Read the images of all frames of one trajectory, in the order of time.
 
         Args:
-            trajectory: Index of the trajectory, one of `full_trajectories()`. For another trajectory, the result has
-                only the frames that the dataset contains.
+            trajectory: Index of the trajectory. `full_trajectories()` returns the indices of the trajectories that have
+                images of all frames. For all other trajectories, the result has fewer images than there are frames.
         """
         rows = np.flatnonzero((self.frames[:, 0] == trajectory) & (self.frames[:, 2] == 0))
         return self.images(rows[np.argsort(self.frames[rows, 1])])

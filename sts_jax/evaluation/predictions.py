@@ -172,9 +172,9 @@ def predict(
     contains these probabilities. If the model predicts samples but no outcome probabilities, the outcome probabilities
     are the shares of the outcomes among the samples.
 
-    If the model predicts no pose, the outcome follows from the predicted visual image. If the image shows no object,
-    the outcome is `FELL_OFF`. If the image shows an object, the outcome is the scenario's other outcome. If the
-    scenario has more than two outcomes, or if `validation` or `blank` is None, the outcome is None.
+    If the model predicts no pose, the outcome follows from the predicted visual image, but only if the scenario has two
+    outcomes and neither `validation` nor `blank` is None. If the image shows no object, the outcome is `FELL_OFF`, and
+    otherwise it is the second outcome. In all other cases, the predicted outcome is None.
 
     Args:
         predictor: The model.

@@ -49,7 +49,7 @@ def full_table(summary: dict, *, title: str, notes: Sequence[str] = (), metrics:
         metrics: The metrics, in the order of the columns.
 
     Returns:
-        The text, with an explanation of the metrics above the tables.
+        The text. It consists of the title, an explanation of the metrics, the tables and the notes.
 
     Raises:
         ValueError: The summary lacks a metric.

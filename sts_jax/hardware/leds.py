@@ -130,8 +130,8 @@ class Leds:
     def find(cls, serial_number: str, *, timeout_s: float = 5.0) -> "Leds":
         """Search the USB ports for the controller with a given serial number, and connect to it.
 
-        The controller reports its serial number only through an open port. The USB ports are therefore opened one after
-        the other until the controller is found. Ports that have `serial_number` in their USB descriptor come first.
+        The method opens the USB ports one after the other, and asks for the serial number, until the controller is
+        found. It begins with the ports whose USB descriptor contains this serial number, which some boards provide.
         Opening a port restarts most boards.
 
         Args:

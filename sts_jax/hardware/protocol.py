@@ -26,9 +26,9 @@ DARK: Levels = (0, 0, 0, 0)
 
 
 class Code(enum.IntEnum):
-    """Reason why the LED controller refused a request, such as a damaged line or an unknown command."""
+    """Reason why the LED controller refused a request, such as a wrong checksum or an unknown command."""
 
-    CHECKSUM = 1  # the line is damaged
+    CHECKSUM = 1  # the checksum of the line is wrong
     COMMAND = 2  # there is no such command
     ARGUMENTS = 3  # the arguments are too few, too many or out of range
     VERSION = 4  # the host uses another version of the protocol

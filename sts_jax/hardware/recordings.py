@@ -134,7 +134,7 @@ class Recordings:
         return (read_trajectory(self.folder, number) for number in self.numbers)
 
     def images(self, convert: Callable[[Image], Image] = lambda image: image) -> Images:
-        """Read the images of all trajectories into arrays.
+        """Read the images of all confirmed trajectories into arrays.
 
         The raw images (1640 x 1232 pixels) of 500 trajectories need 12 GB of memory. Use `convert` to make the images
         smaller.
@@ -149,7 +149,7 @@ class Recordings:
         Raises:
             FileNotFoundError: A trajectory was discarded after these recordings were loaded.
             DamagedFileError: A file is missing or damaged.
-            ValueError: There is no confirmed trajectory.
+            ValueError: The session has no trajectory that a user confirmed.
         """
         if not self.numbers:
             raise ValueError(

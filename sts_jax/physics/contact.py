@@ -50,10 +50,10 @@ class Hull(NamedTuple):
 
 
 class Contacts(NamedTuple):
-    """k contact points of an object with the pad or the stop wall. The fields mean the same as in MuJoCo's `mjContact`.
+    """k contact points of an object with the pad or the stop wall, with fields as in MuJoCo's `mjContact`.
 
-    The pad and the stop wall are boxes. `collide` returns the contacts with one box, as points relative to the centre
-    of the box's top. `scene.step` needs the points in the sensor frame.
+    The pad and the stop wall are boxes. The points that `collide` returns are in the frame of the box, whose origin is
+    the centre of its top. The caller of `scene.step` must convert them to the sensor frame.
     """
 
     dist: Float[Array, "k"]  # m, negative for penetration, 1 where there is no contact

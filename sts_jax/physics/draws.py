@@ -20,7 +20,7 @@ _FURTHER = 2**32 - 1  # `starts` folds it into the key. `simulate` folds in the 
 
 
 class Starts(NamedTuple):
-    """Random starts of one or more bodies. A start is an initial pose with hidden properties.
+    """Random starts of one or more bodies. A start consists of an initial pose and the hidden properties of the body.
 
     Each array has the length n, which is the number of starts of all bodies together. All starts of the first body come
     first, then all starts of the second body, and so on.

@@ -36,9 +36,9 @@ class Inclined(Scenario):
     """An object starts at rest on the tilted pad, or is released just above it. Downhill is +y.
 
     A stop wall stands at the lower edge of the pad. Before the start, the contents of an object settle while the object
-    has a random orientation. The field `tilt` limits this orientation. On the slope, the contents do not move inside
-    the object, so the contents have the same place in the object in all frames. For a start at rest, the centre of
-    pressure in frame 0 reveals this place. The weight alone reveals little about this place.
+    has a random orientation. The field `tilt` is the largest tilt of the object in this orientation. On the slope, the
+    contents do not move inside the object, so the contents have the same place in the object in all frames. For a start
+    at rest, the centre of pressure in frame 0 reveals this place. The weight alone reveals little about this place.
 
     In most poses, the contents hardly matter: a flat object stays and a high object tips, wherever its contents lie.
     For a start at rest, several random poses are therefore compared (the field `tries` is their number). The object

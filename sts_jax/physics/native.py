@@ -200,8 +200,8 @@ def roll(
 ) -> tuple[Ends, Record]:
     """Simulate n independent trajectories of the same body, each from its start to its last frame.
 
-    The gravity of a MuJoCo model is constant, and is set to the gravity in the final time step of the trajectory. In
-    time steps with another gravity, the difference acts as a force on the object's centre of mass.
+    A MuJoCo model has a constant gravity. This constant is set to the last gravity of the trajectory. In all time steps
+    with another gravity, the difference acts as a force on the object's centre of mass.
 
     Args:
         models: Models of the n trajectories, each a copy of the result of `compile_body`. Their gravity is overwritten.

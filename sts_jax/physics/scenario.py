@@ -193,8 +193,8 @@ class Scenario(abc.ABC):
     def drift(self, condition: Float[Array, "c"]) -> Float[Array, "2"]:
         """Return the velocity that an object without friction would have relative to the pad.
 
-        Figures draw this velocity as an arrow. Unless a subclass overrides this method, the result is the velocity on
-        release, the x and y that the method `velocity` returns.
+        Figures draw this velocity as an arrow. Unless a subclass overrides this method, the result is the horizontal
+        velocity of the object on its release.
 
         Args:
             condition: Known quantities of the trajectory in SI units, such as an acceleration, (c,). The attribute

@@ -219,7 +219,7 @@ def template(
 
 
 def drawn(model: mujoco.MjModel, like: mjx.Model) -> dict[str, np.ndarray]:
-    """Read the fields of a C MuJoCo model that `set_rigid` changes, such as `body_mass` and `geom_friction`.
+    """Read those fields of a C MuJoCo model that depend on the object, such as `body_mass` and `geom_friction`.
 
     Args:
         model: Model of C MuJoCo.

@@ -2,9 +2,9 @@
 
 Under `jax.vmap`, a function with a data-dependent loop, such as the rasteriser, runs the whole batch for as many
 iterations as its slowest item needs. On a CPU, it is several times as fast to process one item after the other.
-`jax.custom_batching.sequential_vmap` has the same purpose, but no reverse-mode derivative. In this module, the
-derivative is a linear primitive with its own batching rule. The primitive stores the arguments of the function and not
-the intermediate values. The backward pass therefore evaluates the function once more.
+`jax.custom_batching.sequential_vmap` has the same purpose, but no reverse-mode derivative. This module therefore
+defines a JAX primitive for the derivative, with its own rule for `jax.vmap`. The primitive stores the arguments of the
+function and not the intermediate values, so the backward pass evaluates the function once more.
 """
 
 import functools

@@ -2,11 +2,11 @@
 
 The transition is the network that predicts the density of the final pose. For each outcome, such as resting or falling
 off, the density is a mixture of Gaussians. The encoders estimate the states of training objects better than the states
-of other objects. The transition learns from training objects, and its density is too narrow for other objects. The
-necessary correction depends on the inputs.
+of other objects. The transition learns from training objects, and its density is too narrow for other objects. It is
+corrected separately for each combination of inputs, such as the visual image alone or the visual image and the pose.
 
-Three numbers for each subset of the inputs correct the density: an exponent of the probabilities of the outcomes, an
-exponent of the weights of the mixtures, and a factor of the variances. They are temperatures in the sense of Guo et al.
+Three numbers correct the density: an exponent of the probabilities of the outcomes, an exponent of the weights of the
+mixtures, and a factor of the variances. They are temperatures in the sense of Guo et al.
 (2017), "On Calibration of Modern Neural Networks". The first number can make the probabilities of the outcomes less
 certain or more certain. After a short training, these probabilities are often too uncertain, and the number makes them
 more certain. The other two numbers can only widen the density of the pose. In a fit to few objects, a narrower density
@@ -53,8 +53,8 @@ def of_items(config: Config, calibration: Calibration, present: dict[str, Bool[A
         config: Configuration of the model.
         calibration: Values for each subset of the inputs.
         present: Masks `(n,)` of the inputs by name. True means that the item has the input. An item with the input
-            `state` (the true pose, shape and mass) gets 1 for `outcome`, `weight` and `variance`, which leaves the
-            predicted density of its final pose unchanged.
+            `state` (the true pose, shape and mass) gets the values 1, which leave the predicted density of its final
+            pose unchanged.
 
     Returns:
         A `Calibration` whose four arrays, such as `outcome` and `contrast`, have one value for each item, `(n,)`.

@@ -71,7 +71,7 @@ def matrix(code: Float[Array, "*n 12"]) -> Float[Array, "*n 3 3"]:
 
 
 def about_vertical(angle: Float[Array, "*n 2"]) -> Float[Array, "*n 3 3"]:
-    """The matrices of rotations about the z axis. `angle` has the cosine and the sine of each rotation angle."""
+    """Matrices of rotations about the z axis. The last axis of `angle` has the cosine and the sine of the angle."""
     cos, sin, zero = angle[..., 0], angle[..., 1], jnp.zeros_like(angle[..., 0])
     rows = [[cos, -sin, zero], [sin, cos, zero], [zero, zero, zero + 1]]
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)

@@ -122,7 +122,7 @@ def turn_variance(angle: Float[Array, "n 2"], variance: State) -> State:
     A state code consists of numbers that describe the pose, the shape and the mass of an object.
 
     Args:
-        angle: Cosine and sine of the rotation angle of each item.
+        angle: Cosine and sine of the rotation angle for each of the n state codes.
         variance: Variances of the numbers in the state codes. The numbers are assumed to be independent.
 
     Returns:

@@ -21,8 +21,8 @@ def surface_normals(
             and b columns. The axes *n are batch axes of separate grids.
 
     Returns:
-        Unit normals towards the camera (z <= 0), of shape (h, w, *n, 3). The outermost rows and columns of the grid
-        have no normals, so h = a - 2 and w = b - 2.
+        Unit normals with a z component <= 0, which point towards the camera, of shape (h, w, *n, 3). The outermost rows
+        and columns of the grid have no normals, so h = a - 2 and w = b - 2.
     """
     height, width = (n - 2 for n in points[0].shape[:2])
     # Differences from the middle point, in millimetres, preserve the precision of float32.

@@ -60,9 +60,8 @@ class Arrays:
 
         Args:
             index: Indices of the samples.
-            further: The keyword argument `views` has row indices for all arrays in the field `views`, and the keyword
-                argument `falls` has row indices for all arrays in the field `falls`. A row is an entry along the first
-                axis. If an argument is missing, the batch lacks the field of the same name.
+            further: Two optional keyword arguments, `views` and `falls`. Each has indices along the first axis of the
+                arrays in the field of the same name. If one of them is missing, the batch lacks this field.
 
         Returns:
             A dictionary from the name of each field to its selected arrays. The field `empty` is included as a whole.

@@ -30,7 +30,7 @@ class Preprocessing:
     A scenario condition has the known quantities of a trajectory, such as the acceleration of the pad.
 
     Raises:
-        ValueError: `rotation` is unknown, `touch_block` does not divide `resolution`, or `touch_blocks` is below 1.
+        ValueError: A field has a value that is not allowed. The message names the field.
     """
 
     resolution: tuple[int, int] = (64, 64)  # height and width of the images (pixels)
