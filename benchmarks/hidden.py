@@ -181,8 +181,7 @@ def gains(study: Study, items: list[objects.Body], starts: Starts, read: np.ndar
         study: Settings of the scenario.
         items: The objects.
         starts: Initial states and outcomes of these objects' trajectories, with one row for each trajectory.
-        read: Estimates of `study.touch(starts)` by a network that saw the tactile images, `(n, k)`. None: print no
-            lines for the network.
+        read: Result of `pictures`: estimates from tactile images, `(n, k)`. None: print no lines for these estimates.
     """
     exact = study.touch(starts)
     rough = exact + study.noise * np.random.default_rng(0).normal(size=exact.shape)

@@ -1,4 +1,4 @@
-"""Predict the images and the pose at rest of an object that falls on the pad, from a frame of the object in the air.
+"""Predict the final images and the final pose of an object that falls on the pad.
 
     python -m experiments.freefall                    # 10 to 30 minutes on two CPU cores
     python -m experiments.freefall --preset long      # 1.5 to 2.5 hours, can be stopped and started again

@@ -270,7 +270,7 @@ def draw(config: Config, real: Side, simulated: Side, *, matched: bool) -> None:
 
 
 def main(config: Config) -> None:
-    """Read the images, measure and print the distances, and draw the figure.
+    """Read the real and the simulated images, print how much they differ, and draw the figure.
 
     Raises:
         ValueError: An option is out of range, two options contradict each other, or there is nothing to compare.

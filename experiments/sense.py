@@ -1,6 +1,6 @@
 """Render an object on the sensor, and draw all outputs in one picture. Try this command first.
 
-    python -m experiments.sense bottle --out bottle.png     # one of the eight classes. Takes 20 s, and later 5 s
+    python -m experiments.sense bottle --out bottle.png     # one of the eight classes
     python -m experiments.sense mug.obj --longest-side 0.1 --mass 0.3 --resolution 1232 1640
     python -m experiments.sense classes --out classes.png --resolution 1232 1640    # all eight, about a minute
 

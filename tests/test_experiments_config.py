@@ -59,7 +59,7 @@ def test_image_sizes_divide_the_resolution_and_suit_the_networks(model, side, si
             {"collection": {"crop": True}},
             r"collection\.crop is True, but it must be False .*: give --collection\.no-crop, or --model paper",
         ),
-        ({"model": "paper", "steps": (5,)}, r"steps must have 4 numbers, got \(5,\): .* each model \(mvae, "),
+        ({"model": "paper", "steps": (5,)}, r"steps must have one number for each model \(mvae, .*\), got \(5,\)"),
         (
             {"state_training": training.TrainConfig(steps=100, warmup=150, schedule="cosine")},
             r"state_training\.warmup must be smaller than state_training\.steps \(100\), got 150: give --state-",

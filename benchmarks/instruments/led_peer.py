@@ -79,7 +79,7 @@ class Peer:
         self._thread.start()
 
     def vanish(self) -> None:
-        """Unplug the controller: stop its thread, close its port and remove the link."""
+        """Unplug the emulated controller, so that its port no longer exists."""
         self._stop.set()
         self._thread.join()
         for descriptor in (self._master, self._slave):

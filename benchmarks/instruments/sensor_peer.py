@@ -210,7 +210,7 @@ class SensorPeer:
     def shown(self) -> dict[int, Shown]:
         """Return the mean light during the exposure of each frame that the emulated camera has logged.
 
-        The keys of the returned dictionary are the numbers of the frames. `key` reads this number from an image.
+        The result maps the number of each frame to the light. The function `key` reads the number from an image.
         """
         return {number: Shown(number, exposure.mean) for number, exposure in self.camera.log.items()}
 

@@ -59,7 +59,7 @@ class TwinPeer:
         self.url = self._served.camera
 
     def move(self) -> None:
-        """Release a held object. If no object is held, hold the object in its next pose."""
+        """Release the object if it is held. Otherwise, hold it in its next pose."""
         self.twin.command("release" if self.twin.state.phase == twin.Phase.HELD else "hold")
 
     def stop(self) -> None:

@@ -172,8 +172,8 @@ def check(config: Config) -> None:
         )
     if config.model == "paper" and config.steps is not None and len(config.steps) != len(names):
         raise ValueError(
-            f"steps must have {len(names)} numbers, got {config.steps}: give --steps with one number for each model "
-            f"({', '.join(names)}), or --steps None to train each model for --training.epochs epochs"
+            f"steps must have one number for each model ({', '.join(names)}), got {config.steps}: change --steps, or "
+            "give --steps None to train each model for --training.epochs epochs"
         )
     trained, option = (
         (config.state_training, "state_training") if config.model == "statespace" else (config.training, "training")

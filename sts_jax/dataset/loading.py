@@ -233,7 +233,7 @@ class Dataset:
         return self.split[part]
 
     def ends(self, trajectories: np.ndarray) -> Ends:
-        """Return the first and last poses, conditions and outcomes of trajectories, and the masses of their objects.
+        """Return the data of trajectories that need no images: poses, conditions, outcomes and masses.
 
         Trajectories without images are allowed.
 
@@ -264,7 +264,7 @@ class Dataset:
             part: Name of the part: `train`, `validation` or `test`.
 
         Returns:
-            The images and poses of the views. The arrays are empty if the collection has `num_views=0`.
+            The images and poses of the views. The arrays are empty if the dataset has none.
 
         Raises:
             ValueError: `part` is not `train`, `validation` or `test`.
@@ -307,8 +307,8 @@ class Dataset:
 
         Args:
             trajectories: Indices of the trajectories, int `(n,)`.
-            symmetries: True to add the turned and mirrored copies of the frames. The dataset contains copies if its
-                collection has `symmetries=True`. In the result, each trajectory is directly followed by its copies.
+            symmetries: True to add the turned and mirrored copies of the frames, if the dataset contains copies (see
+                `Collection.symmetries`). In the result, each trajectory is directly followed by its copies.
             measurements: Further modalities to measure. Their values are in `Pairs.measurements`.
 
         Raises:

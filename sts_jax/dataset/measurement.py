@@ -68,7 +68,7 @@ class Measurement:
 def measured(
     measurements: Sequence[Measurement], data: Any, trajectories: np.ndarray, symmetries: Sequence[int]
 ) -> dict[str, np.ndarray]:
-    """Measure the first and last frames of trajectories that can also be turned and mirrored.
+    """Measure the first and last frames of trajectories, optionally after turning and mirroring the trajectories.
 
     Args:
         measurements: The specifications of the modalities.

@@ -152,7 +152,7 @@ class Camera:
         return self._connected().held
 
     def set_exposure(self, exposure: float) -> float | None:
-        """Set the exposure of a device as soon as the next frame has arrived.
+        """Set the exposure of the camera as soon as the next frame has arrived.
 
         The new exposure appears in the images a few frames after the call.
 
@@ -160,7 +160,7 @@ class Camera:
             exposure: New exposure, > 0, in the driver's unit (V4L2: 0.1 ms).
 
         Returns:
-            The exposure that the device has now. It may differ from the argument `exposure`, because drivers round and
+            The exposure that the camera has now. It may differ from the argument `exposure`, because drivers round and
             limit this value. The result is None if the driver does not support a manual exposure.
 
         Raises:

@@ -36,10 +36,10 @@ class Lit:
     acknowledged_s: float  # time at which the answer had arrived (s)
 
     def unchanged_since(self, earlier: "Lit") -> bool:
-        """Return True if the levels did not change between `earlier.acknowledged_s` and `self.sent_s`.
+        """Return True if the levels of the lights have not changed since an earlier answer.
 
         Args:
-            earlier: An earlier answer of the same controller.
+            earlier: The earlier answer, from the same controller.
         """
         return (self.boot, self.counter, self.levels) == (earlier.boot, earlier.counter, earlier.levels)
 

@@ -117,7 +117,9 @@ def draw(
     num: int,
     drawn: int,
 ) -> Drawn:
-    """Sample `num` final poses for each trajectory, and render the layers of the first `drawn` of these poses.
+    """Sample final poses for each trajectory, and render the layers of some of them.
+
+    The function samples `num` poses, and renders the layers of the first ones. The argument `drawn` is their number.
 
     The layers are the outlines and colours of the objects, and the changes that the objects cause in the tactile
     images. `compose` combines them with the images of the empty sensor, and returns complete images. The arguments

@@ -1,4 +1,4 @@
-"""Training arrays and model configurations from the first and the last frames of trajectories."""
+"""Functions that make training arrays from trajectories, and the model configurations that fit these arrays."""
 
 import dataclasses
 import functools
