@@ -177,9 +177,10 @@ def report(found: list[Measured]) -> str:
 
 
 def measure_all(args: Args) -> list[Measured]:
-    """Read `args.pairs` pairs of images in equal parts at the lags in `args.lags_ms`. Return one result per lag.
+    """Read pairs of images from emulated cameras with the lags `args.lags_ms`, and return one result for each lag.
 
-    The lag is the time from the end of an exposure to the sending of the frame by the emulated camera.
+    The lag is the time from the end of an exposure to the sending of the frame. All results together are from
+    `args.pairs` pairs, and each lag has about the same number of pairs.
     """
     number = len(args.lags_ms)
     found = []

@@ -86,7 +86,7 @@ class Args:
 
 @dataclasses.dataclass
 class Count:
-    """The results for one kind of fault: numbers of faults, images and errors, and the longest durations."""
+    """The results of all faults of one kind."""
 
     injected: int = 0  # number of faults
     images: int = 0

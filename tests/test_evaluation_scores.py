@@ -172,7 +172,7 @@ def test_a_deterministic_prediction_scores_its_error_and_the_sharpness_of_its_im
 def test_probabilities_need_the_names_of_their_columns():
     test, predicted = judged()
     with pytest.raises(
-        ValueError, match=r"shape \(6, 2\), but it must have shape \(6, 0\).*pass outcomes=scenario\.outcomes"
+        ValueError, match=r"shape \(6, 2\), but it must have shape \(6, 0\).*pass .* and outcomes=scenario\.outcomes"
     ):
         evaluation.score(predicted, test)
 

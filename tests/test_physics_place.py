@@ -121,7 +121,7 @@ def test_more_shell_or_contents_weigh_more(bodies):
         ({"yaw": float("inf")}, "yaw is inf, but it must be one finite number"),
         ({"fill": 1.5}, "fill is 1.5, .* from 0 to 1"),
         ({"shell_scale": 0.0}, "shell_scale is 0.0, but it must be > 0"),
-        ({"up": (0.0, 0.0, 2.0)}, r"`up` is .* unit vector"),
+        ({"up": (0.0, 0.0, 2.0)}, r"`up` is .* which has the length 2, but it must have the length 1"),
     ],
 )
 def test_errors_name_arguments_of_place_that_are_out_of_range(bodies, changes, message):

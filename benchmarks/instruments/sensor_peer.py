@@ -68,7 +68,7 @@ class Lights:
 
 
 class SeenController(EmulatedController):
-    """An emulated LED controller that logs the brightness of the LEDs in `lights`, where the camera reads it."""
+    """An emulated LED controller that passes the brightness of its LEDs on to the emulated camera."""
 
     def __init__(self, lights: Lights, **options: object):
         super().__init__(**options)  # type: ignore[arg-type]

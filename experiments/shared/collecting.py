@@ -234,7 +234,7 @@ class AutomaticTerminal(AutomaticPerson):
 
 
 class AutomaticPage(AutomaticPerson):
-    """A `Person` for `hardware.collect` that confirms every trajectory automatically, and shows a page with buttons."""
+    """A `Person` that confirms every trajectory by itself. A user can watch on a page, and can still press its buttons."""
 
     def __init__(self, page: Page):
         super().__init__()

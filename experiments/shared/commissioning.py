@@ -182,8 +182,8 @@ def live(config: Config, sensor: hardware.STS, pinhole: hardware.Pinhole) -> har
             that rectified images show, or the camera does not see this whole part. The message explains how to replace
             or add pictures.
         ValueError: A picture of an earlier run cannot be read, or its size differs from that of the camera's images.
-            The error is also raised if `config.every` is None and there is no keyboard, because the Enter key must then
-            be pressed before each picture.
+            There is no keyboard, although `config.every` is None, which means that the user presses the Enter key
+            before each picture.
     """
     folder, size = config.out / "board", (config.width, config.height)
     pictures = boards.Pictures.read(folder, config.board, size)

@@ -36,9 +36,7 @@ class Review:
 
 
 def review(config: Review) -> None:
-    """Change the states of recorded trajectories. Then check their files, draw their images, or list all trajectories.
-
-    The options `--restore`, `--confirm` and `--discard` name the trajectories that get a new state.
+    """Do what the options select: change states of trajectories, check files, draw images, or list the trajectories.
 
     Raises:
         SystemExit: `check` is True, and a file is damaged.

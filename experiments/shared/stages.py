@@ -28,9 +28,9 @@ def main(config: Config, workdir: Path, *, only: Stage | None = None, own: Exten
         own: Your own loss, optimiser, logger, metrics, modalities (field `measurements`) and notes.
 
     Raises:
-        ValueError: A field of the configuration is out of range, the work directory has another configuration, or a
-            model in it was trained with another loss or optimiser or with other notes. Also raised if
-            `own.measurements` is not empty, but `config.model` is not "paper".
+        ValueError: A field of the configuration is out of range, or the work directory has another configuration. The
+            error is also raised if a model in the work directory was trained with other extensions than `own`, or if
+            `own.measurements` is not empty although `config.model` is not "paper".
         FileNotFoundError: A stage before `only` has not been run.
         LockedError: Another process works in the work directory.
     """

@@ -233,9 +233,9 @@ class Dataset:
         return self.split[part]
 
     def ends(self, trajectories: np.ndarray) -> Ends:
-        """Return the data of trajectories that need no images: poses, conditions, outcomes and masses.
+        """Return the poses, conditions, outcomes and masses of some trajectories, without their images.
 
-        Trajectories without images are allowed.
+        The trajectories may also be those for which the dataset has no images.
 
         Args:
             trajectories: Indices of the trajectories, int `(n,)`.

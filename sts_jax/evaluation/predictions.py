@@ -172,9 +172,9 @@ def predict(
     contains these probabilities. If the model predicts samples but no outcome probabilities, the outcome probabilities
     are the shares of the outcomes among the samples.
 
-    If the model predicts no pose, the outcome follows from the predicted visual image, but only if the scenario has two
-    outcomes and neither `validation` nor `blank` is None. If the image shows no object, the outcome is `FELL_OFF`, and
-    otherwise it is the second outcome. In all other cases, the predicted outcome is None.
+    If the model predicts a visual image but no pose, and if the scenario has two outcomes, the outcome follows from the
+    image: `FELL_OFF` if the image shows no object, and the other outcome if it shows an object. This needs the
+    arguments `validation` and `blank`. If they are None, the predicted outcome is None too.
 
     Args:
         predictor: The model.

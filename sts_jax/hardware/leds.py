@@ -36,7 +36,7 @@ class Lit:
     acknowledged_s: float  # time at which the answer had arrived (s)
 
     def unchanged_since(self, earlier: "Lit") -> bool:
-        """Return True if the levels of the lights have not changed since an earlier answer.
+        """Return True if the levels of the lights did not change between an earlier answer and this one.
 
         Args:
             earlier: The earlier answer, from the same controller.

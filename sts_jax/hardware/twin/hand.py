@@ -75,8 +75,8 @@ class Hand(AutomaticPerson):
         if self._now_s - self._since_s > self._patience_s or self._unseen == _UNSEEN:
             raise ValueError(
                 f"hardware.collect has shown the instruction `{view.instruction}` for "
-                f"{self._now_s - self._since_s:.1f} s (contact: {view.contact}, still: {view.still}, successive "
-                f"poses without contact: {self._unseen}). The thresholds of hardware.collect do not suit the images of "
+                f"{self._now_s - self._since_s:.1f} s (contact: {view.contact}, still: {view.still}). "
+                f"Number of poses that the hand tried without a detected contact: {self._unseen}. The thresholds of hardware.collect do not suit the images of "
                 f"the simulated sensor, or patience_s of Hand ({self._patience_s:g} s) is too short. Change "
                 "the argument config (a GuideConfig) of hardware.collect, or increase patience_s"
             )
