@@ -68,8 +68,8 @@ def test_trajectories_do_not_depend_on_the_number_of_rendered_ones(folder, spars
         np.testing.assert_array_equal(data.members(part, rendered=False), whole.members(part))
     for one, other in zip(data.pairs(np.array([4])), whole.pairs(np.array([4])), strict=True):
         np.testing.assert_array_equal(one, other)
-    with pytest.raises(ValueError, match=r"`trajectories` contains 3, which has no images: use `ends`.* images for 1 of
-        its"): data.pairs(np.array([2, 3]))
+    with pytest.raises(ValueError, match=r"`trajectories` contains 3, which has no images: .* images for 1 of its"):
+        data.pairs(np.array([2, 3]))
     rows = evaluation.rows_of(data, "trajectory")
     np.testing.assert_array_equal(np.sort(np.concatenate([rows["train"], rows["test"]])), data.rendered())
     ends = data.ends(np.array([3, 0]))

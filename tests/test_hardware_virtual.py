@@ -223,10 +223,7 @@ def test_a_pose_without_contact_is_left_out_with_its_number(tmp_path):
 
 
 def test_a_guide_that_waits_for_ever_ends_with_an_error(tmp_path):
-    with pytest.raises(
-        ValueError, match=r"Place the object.*\(contact: False, still: True\)\. Number of poses .* without a detected
-        contact: 10\."
-    ):
+    with pytest.raises(ValueError, match=r"Place the object.*still: True\)\. .*without a detected contact: 10\."):
         collected(Spots(unseen=range(20)), tmp_path / "unseen", 1)
     with pytest.raises(ValueError, match=r"Take everything.* for 0.\d s .*of hardware.collect do not suit"):
         collected(Spots(), tmp_path / "impatient", 1, patience_s=0.1)

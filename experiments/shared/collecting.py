@@ -234,7 +234,7 @@ class AutomaticTerminal(AutomaticPerson):
 
 
 class AutomaticPage(AutomaticPerson):
-    """A `Person` that confirms every trajectory by itself. A user can watch on a page, and can still press its buttons."""
+    """A `Person` that confirms every trajectory by itself. A user can watch on a page and press its buttons."""
 
     def __init__(self, page: Page):
         super().__init__()

@@ -76,9 +76,10 @@ class Hand(AutomaticPerson):
             raise ValueError(
                 f"hardware.collect has shown the instruction `{view.instruction}` for "
                 f"{self._now_s - self._since_s:.1f} s (contact: {view.contact}, still: {view.still}). "
-                f"Number of poses that the hand tried without a detected contact: {self._unseen}. The thresholds of hardware.collect do not suit the images of "
-                f"the simulated sensor, or patience_s of Hand ({self._patience_s:g} s) is too short. Change "
-                "the argument config (a GuideConfig) of hardware.collect, or increase patience_s"
+                f"Number of poses that the hand tried without a detected contact: {self._unseen}. "
+                "The thresholds of hardware.collect do not suit the images of the simulated sensor, or patience_s of "
+                f"Hand ({self._patience_s:g} s) is too short. Change the argument config (a GuideConfig) of "
+                "hardware.collect, or increase patience_s"
             )
 
     def action(self) -> Action | None:
