@@ -162,9 +162,9 @@ def difference(depth: np.ndarray, truth: np.ndarray) -> Difference:
 
 
 def total(differences: Sequence[Difference]) -> Difference:
-    """Combine the depth differences of several images.
+    """Combine the results of `difference` for several images.
 
-    The pixel counts are added. `worst`, the largest depth error in interior pixels, is the maximum over all images.
+    Numbers of pixels are added. The field `worst`, the largest error, becomes the largest error in all images.
     """
     added = {name: sum(getattr(d, name) for d in differences) for name in Difference._fields if name != "worst"}
     return Difference(**added, worst=max(d.worst for d in differences))

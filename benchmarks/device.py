@@ -49,7 +49,7 @@ class Args:
     """Options of the command line.
 
     Raises:
-        ValueError: `lags_ms` is empty, or the number of its values is larger than the number `pairs`.
+        ValueError: `lags_ms` is empty, or `pairs` is smaller than the number of lags.
     """
 
     pairs: int = 1000  # number of pairs of images, of all lags together

@@ -101,7 +101,7 @@ class Count:
     lit_s: float = 0.0  # longest time for which a light was on after the program was killed
 
     def add(self, other: "Count") -> None:
-        """Add the results of other faults of the same kind."""
+        """Add the results in `other`, which are of further faults of the kind."""
         for name in ("injected", "images", "wrong", "old", "unnamed", "recovered"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
         for name, number in other.errors.items():

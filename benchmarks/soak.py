@@ -62,7 +62,7 @@ class Args:
 def excess_energy(
     rigid: tuple[np.ndarray, np.ndarray, np.ndarray], pose: np.ndarray, velocity: np.ndarray, gravity: np.ndarray
 ) -> np.ndarray:
-    """Kinetic and potential energy in each frame, minus their sum in the first frame.
+    """Compute the mechanical energy in each frame, minus the mechanical energy in the first frame.
 
     Args:
         rigid: Mass (kg), `(n,)`, centre of mass in the mesh frame (m), `(n, 3)`, and inertia (kg m^2), `(n, 3, 3)`.

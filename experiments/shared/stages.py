@@ -137,8 +137,8 @@ def jobs(
 
     Args:
         config: Configuration of the experiment.
-        sensor: Sensor of the collection.
-        pairs: First and last frames of the training trajectories, with images at the resolution of the collection.
+        sensor: Sensor with which the dataset was rendered.
+        pairs: First and last frames of the training trajectories, with images at the resolution of the dataset.
         views: Further images of the training objects. Only the state-space model uses them.
         falls: First and last poses in trajectories of the training objects, without images. Only the state-space model
             uses these poses.

@@ -36,8 +36,8 @@ class State(NamedTuple):
     touches: Int[Array, ""]  # number of contacts that began after at least PARTED_TIME without contact
     sunk: Float[Array, ""]  # m, largest depth of a hull vertex or a contact so far
     finite: Bool[Array, ""]  # all states so far were finite
-    impulse: Float[Array, "6"]  # wrench summed over the steps of the unbroken contact within this frame's interval
-    loaded: Int[Array, ""]  # number of steps in `impulse`
+    wrenches: Float[Array, "6"]  # wrench summed over the steps of the unbroken contact within this frame's interval
+    loaded: Int[Array, ""]  # number of steps in `wrenches`
     wall: Bool[Array, ""]  # the stop wall pushes the object
 
 
@@ -72,7 +72,7 @@ def initial(pose: Float[Array, "7"], velocity: Float[Array, "6"], held: Int[Arra
         touches=zero,
         sunk=jnp.zeros(()),
         finite=jnp.ones((), bool),
-        impulse=jnp.zeros(6),
+        wrenches=jnp.zeros(6),
         loaded=zero,
         wall=jnp.zeros((), bool),
     )
@@ -114,12 +114,11 @@ def _depth(points: Float[Array, "3 h"], model: mjx.Model) -> Float[Array, ""]:
 def step(model: mjx.Model, data: mjx.Data, hull: Hull, state: State, gravity: Float[Array, "3"]) -> State:
     """Advance a state by one time step.
 
-    The field `impulse` of the state is the sum of the wrenches of the pad on the object over successive steps with
-    contact. The step adds its own wrench to this sum, or sets the sum to 0 if the pad does not push the object. A
-    wrench is the total over all contacts with the pad, and its moment is about the sensor's origin. If the scene has a
-    stop wall, contacts with the wall are not part of the wrench.
+    The step adds the wrench of the pad on the object to the field `wrenches` of the state, or sets this field to 0 if
+    the pad does not push the object. This wrench is the total over all contacts with the pad, and its moment is about
+    the sensor's origin. If the scene has a stop wall, contacts with the wall are not part of the wrench.
 
-    An object that is held, or that has left the pad, does not move, and its `impulse` is 0.
+    An object that is held, or that has left the pad, does not move, and the field `wrenches` is 0.
 
     Args:
         model: Model of the scene in MJX. Its gravity is replaced.
@@ -160,7 +159,7 @@ def step(model: mjx.Model, data: mjx.Data, hull: Hull, state: State, gravity: Fl
         touches=old.touches + begun,
         sunk=jnp.maximum(old.sunk, jnp.maximum(_depth(points, model), -jnp.min(contacts.dist))),
         finite=old.finite & jnp.all(jnp.isfinite(new.qpos)) & jnp.all(jnp.isfinite(new.qvel)),
-        impulse=jnp.where(contact, old.impulse + wrench, 0),
+        wrenches=jnp.where(contact, old.wrenches + wrench, 0),
         loaded=jnp.where(contact, old.loaded + 1, 0),
         wall=wall,
     )
@@ -176,7 +175,7 @@ def _unless_frozen(old: State, now: State) -> State:
     frozen = old._replace(
         qvel=jnp.where(old.gone, nothing.qvel, old.qvel),
         held=jnp.maximum(old.held - 1, 0),
-        impulse=nothing.impulse,
+        wrenches=nothing.wrenches,
         loaded=nothing.loaded,
         wall=nothing.wall,
     )
@@ -189,7 +188,7 @@ def _record(state: State) -> Record:
     return Record(
         pose=jnp.concatenate([state.qpos[:3], geometry.quat_canonical(state.qpos[3:])]),
         velocity=jnp.concatenate([state.qvel[:3], turn]),
-        wrench=jnp.where(contact, state.impulse / jnp.maximum(state.loaded, 1), 0),
+        wrench=jnp.where(contact, state.wrenches / jnp.maximum(state.loaded, 1), 0),
         contact=contact,
         wall=state.wall,
     )
@@ -218,7 +217,7 @@ def roll(
     """
 
     def interval(state: State, gravity: Float[Array, "steps 3"]) -> tuple[State, Record]:
-        state = state._replace(impulse=jnp.zeros(6), loaded=jnp.zeros((), jnp.int32))
+        state = state._replace(wrenches=jnp.zeros(6), loaded=jnp.zeros((), jnp.int32))
         state, _ = jax.lax.scan(lambda s, g: (step(model, data, hull, s, g), None), state, gravity)
         return state, _record(state)
 

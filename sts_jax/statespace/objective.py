@@ -69,9 +69,8 @@ def experts(
 
     Returns:
         The experts by name of the input, each of shape `(n, code + look)`. `code` is the length of the state code, and
-        `look` is the length of the appearance code. The input `pose` contains the first
-        entries of the state code, and the input `state` contains the whole state code. For all other entries of the two
-        codes, the experts of these inputs have a very large variance.
+        `look` is the length of the appearance code. The expert of the input `pose` has a very large variance for all
+        numbers except the pose, and the expert of the input `state` for all numbers of the appearance code.
     """
     # Masked items are set to zero before the networks, because 0 * NaN would make the product and its gradient NaN.
     change = {name: _counted(counts[name], inputs[name] - empty[name]) for name in IMAGES if name in inputs}
