@@ -139,8 +139,8 @@ def outcomes(study: Study, starts: Starts) -> None:
 
     A start is the initial state of a trajectory. The outcome is how the trajectory ends, such as by toppling. A start
     is unsettled if its object lies on the pad at the end of the trajectory but has not come to rest. For the last
-    share, each trajectory was simulated again from the same start, but with other random contents of the object. The
-    new contents have another fill level and, in the scenario `inclined`, another place inside the object.
+    share, some of the trajectories were simulated again from the same starts, but with other random contents. The new
+    contents have another fill level and, in the scenario `inclined`, another place inside the object.
     """
     share = functools.partial(classifier.interval, classifier.mean, groups=starts.body)
     for outcome in study.scenario.outcomes:

@@ -99,7 +99,8 @@ def _panels(thing: Frame | Body | Prediction | ArrayLike) -> list[_Panel]:
         panels = [_Panel(f"predicted {name}", np.asarray(x)) for name, x in streams.items() if x is not None]
         if not panels:
             raise ValueError(
-                "the prediction has no image, because its model predicts only poses. Print the prediction instead"
+                "the prediction has no image, because its model predicts neither the visual nor the tactile image. "
+                "Print the prediction instead"
             )
         for panel in panels:
             _check_single("Prediction", panel.values, 3)
@@ -173,14 +174,16 @@ def load(path: str | os.PathLike[str]) -> Any:
         ValueError: The path is a folder, or its suffix is not `.npz`.
         DamagedFileError: The file is damaged, or was written by another program or by another version of `save`.
             DamagedFileError is an OSError.
+        OSError: The file cannot be read.
     """
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file. Write one with sts.save")
     if path.is_dir() or path.suffix.lower() != ".npz":
         raise ValueError(f"path is {str(path)!r}, but it must be an .npz file that sts.save wrote")
+    data = path.read_bytes()
     try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
+        with np.load(io.BytesIO(data), allow_pickle=False) as file:
             arrays = dict(file)
         kind, version = _KINDS[str(arrays.pop("kind"))], int(arrays.pop("format"))
         if version != _FORMAT:

@@ -80,6 +80,16 @@ def test_a_damaged_file_raises_an_error_unless_the_damage_is_outside_the_arrays(
         sts.load(path)
 
 
+def test_a_file_that_cannot_be_read_is_not_called_damaged(tmp_path, monkeypatch):
+    def refuse(path):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    sts.save(tmp_path / "x.npz", FRAME)
+    monkeypatch.setattr(type(tmp_path), "read_bytes", refuse)
+    with pytest.raises(PermissionError, match=r"x\.npz"):
+        sts.load(tmp_path / "x.npz")
+
+
 def test_a_file_of_another_format_raises_an_error(tmp_path):
     np.savez(tmp_path / "x.npz", kind=np.array("Frame"), format=np.array(99))
     with pytest.raises(DamagedFileError, match="format 99"):

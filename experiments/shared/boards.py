@@ -34,7 +34,7 @@ def wait(text: str, every: float | None) -> str:
         The text that was typed before Enter, in lower case. It is empty if `every` is given.
 
     Raises:
-        ValueError: There is no keyboard.
+        ValueError: `every` is None, but there is no keyboard.
     """
     if every is not None:
         print(f"{text} Continues in {every:g} s.", flush=True)

@@ -153,7 +153,7 @@ def _pairs_of_split(config: Config, data: dataset.Dataset, split: str, own: Exte
 
 
 def queries(config: Config, workdir: Path, split: str) -> Iterator[tuple[str, sts.Predictor, tuple[str, ...]]]:
-    """Combine each model with each subset of the inputs that the model supports.
+    """Combine each model with the subsets of its inputs that are scored (`evaluation.subsets`).
 
     Yields:
         The title of the row in the tables, the model, and the names of the inputs in the subset.

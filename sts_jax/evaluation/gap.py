@@ -26,11 +26,11 @@ PENALTY = 10.0  # weight of the classifier's L2 regularisation, for features of 
 
 
 class Streams(NamedTuple):
-    """n images of the visual stream and n of the tactile stream, and the trajectory number of each image."""
+    """n pairs of a visual and a tactile image, and the number of the trajectory of each pair."""
 
     visual: np.ndarray  # uint8 (n, height, width, 3)
     tactile: np.ndarray  # uint8 (n, height, width, 3)
-    group: np.ndarray  # int (n,): number of the trajectory of each image
+    group: np.ndarray  # int (n,): number of the trajectory of each pair
 
 
 class Estimate(NamedTuple):

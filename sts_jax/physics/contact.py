@@ -253,8 +253,8 @@ def collide(
 
     The first contact is the deepest candidate. The second contact is the deepest of the candidates that are more than
     1 mm (`APART`) away from the first contact. For each of `num` - 2 evenly spaced directions, the candidate with the
-    largest score is a contact. The score of a candidate is its coordinate along the direction plus `STEEP` (5) times
-    its depth. Distances and directions are measured in `plane`.
+    largest score is a contact, unless it is a contact already. The score of a candidate is its coordinate along the
+    direction plus `STEEP` (5) times its depth. Distances and directions are measured in `plane`.
 
     Args:
         body: Convex parts of the object.

@@ -23,7 +23,7 @@ _transform = jax.jit(geometry.transform)
 
 
 class StableFaces(NamedTuple):
-    """The faces of a body's convex hull on which the body can rest, the most likely first."""
+    """The faces of a body's convex hull on which the body can rest."""
 
     up: Float[np.ndarray, "k 3"]  # Unit vector in the mesh frame that points up while the body rests on each face.
     # Solid angle of each face, seen from the centre of mass, as a share of the sum over all stable faces.

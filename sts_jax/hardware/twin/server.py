@@ -25,8 +25,8 @@ class Served:
     ```
 
     The server runs in threads of this process. The serial port, the camera, the rendering, the HTTP server and each
-    HTTP connection have a thread of their own. One more thread holds and releases the object at random times if the
-    argument `release_every` of `Twin` is given. `close` stops all threads.
+    HTTP connection have a thread of their own. If the argument `release_every` of `Twin` is given, one more thread
+    holds and releases the object at random times. `close` stops all threads.
     """
 
     def __init__(
