@@ -96,7 +96,7 @@ class Args:
 
 
 class Speeds(NamedTuple):
-    """Steps per second for a number of worlds: MJX in one call, MJX in chunks of worlds, and C MuJoCo."""
+    """Steps per second of all worlds together: MJX in one call, MJX in chunks of worlds, and C MuJoCo."""
 
     worlds: int  # trajectories that are simulated together
     at_once: float  # MJX, one call for all worlds

@@ -137,7 +137,7 @@ class SeenLights(MotionJpeg):
         return jpeg(image)
 
     def exposure_of(self, image: Image) -> Exposure | None:
-        """Look up the exposure of an image by the frame number that a corner of the image shows.
+        """Look up the time and the light of an image's exposure by the frame number that a corner of the image shows.
 
         Return None if the camera has not taken such an image.
         """

@@ -135,7 +135,9 @@ class Pictures:
 
 
 def take(pictures: Pictures, sensor: hardware.STS, number: int, every: float | None, say: Say = print) -> Pictures:
-    """Take pictures of the board until there are enough. Each picture is written to the folder at once.
+    """Take pictures until the board was found in enough of them. All other pictures are discarded.
+
+    Each picture that is kept is written to the folder at once.
 
     Args:
         pictures: Pictures of an earlier run, which count towards `number`. If `000.png` is missing, the first new
@@ -143,10 +145,10 @@ def take(pictures: Pictures, sensor: hardware.STS, number: int, every: float | N
         sensor: Connected sensor.
         number: Number of pictures in which the board must be found.
         every: Time to wait before each picture (s). None: wait for the Enter key.
-        say: Function that receives one line for each picture.
+        say: Function that receives one line of text for each picture.
 
     Returns:
-        All pictures. There are fewer than `number` if the person typed `done`.
+        All pictures that were kept. There are fewer than `number` if the person typed `done`.
 
     Raises:
         OSError: A picture cannot be written.

@@ -104,7 +104,7 @@ def reroll(
         test: Trajectories to re-roll.
         times: Number of re-rolls of each trajectory.
         judge: Function that scores a prediction of the trajectories in `test`.
-        progress: Function that receives the number of simulated re-rolls.
+        progress: Function that receives the total number of re-rolls that have been simulated so far.
     """
     mean = evaluation.ceiling(collection, sensor, test, times, jax.random.key(SEED), progress=progress)
     samples = mean.samples

@@ -55,7 +55,7 @@ def render(
             mirrored frames of an object (symmetries 4 to 7) follow its other frames.
         views: The v views, sorted by object. The array `pose`, `(v, 7)`, has the poses of the objects: position (m) and
             quaternion (w, x, y, z). The array `body`, int `(v,)`, has indices into `bodies`.
-        report: Function that is called after each batch with the number of images that are finished so far.
+        report: Function that is called after each batch with the number of frames and views that are finished so far.
 
     Yields:
         Batches of images in the order in which they are stored. A batch of frames has the visual images, the tactile

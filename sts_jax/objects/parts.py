@@ -59,9 +59,9 @@ def convex_parts(
         )
         parts = [convex_hull(np.asarray(corners, float), limit=vertices_per_part) for corners, _ in pieces]
     except (RuntimeError, ValueError) as error:
-        raise ValueError(f"the surface has no decomposition into convex parts ({error}): {_KEEP}") from error
+        raise ValueError(f"the surface cannot be decomposed into convex parts ({error}): {_KEEP}") from error
     if not parts:
-        raise ValueError(f"the surface has no decomposition into convex parts: {_KEEP}")
+        raise ValueError(f"the surface cannot be decomposed into convex parts: {_KEEP}")
     return sorted(parts, key=lambda part: (-ConvexHull(part).volume, *part[0]))
 
 

@@ -81,7 +81,7 @@ def locate(change: Float[Array, "n size size 3"]) -> Window:
 def cut(images: Float[Array, "n size size c"], window: Window, side: int) -> Float[Array, "n side side c"]:
     """Cut the windows out of images, and resample each window to `side` x `side` pixels.
 
-    A pixel of the result is the mean of four values that are interpolated bilinearly. Values outside the image are 0.
+    A pixel of the result is the mean of four values from `sample`.
 
     Args:
         images: Square images.
@@ -101,14 +101,14 @@ def cut(images: Float[Array, "n size size c"], window: Window, side: int) -> Flo
 
 
 def sample(images: Float[Array, "n side side c"], places: Float[Array, "n m 2"]) -> Float[Array, "n m c"]:
-    """Interpolate each image bilinearly at m places.
+    """Interpolate each image bilinearly at m places. The pixels of a border around the image count as 0.
 
     Args:
         images: Square images.
         places: Column and row of each place (pixels). Whole numbers are pixel centres.
 
     Returns:
-        Values at the places. Values outside the image are 0.
+        Values at the places, 0 at places that are more than one pixel beyond the centres of the outermost pixels.
     """
     framed = jnp.pad(images, ((0, 0), (1, 1), (1, 1), (0, 0)))
     return bilinear_batch(framed, places[..., 0] + 1, places[..., 1] + 1)
