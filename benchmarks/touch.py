@@ -4,7 +4,7 @@
     python -m benchmarks.touch FOLDER   # another dataset of procedural objects of all classes
 
 A ridge regression of the logarithm of the mass on simple features of the image is fitted to the training objects. The
-features are the summed darkness of the imprint, its largest darkness and its number of pixels. The command uses the
+features are computed from the number of the imprint's pixels and from their darkness. The command uses the
 last images of objects that rest on the pad. It prints the accuracy on held-out objects, and the share of imprint pixels
 that are saturated (value 0 or 255 in a channel). It writes no files.
 """

@@ -2,7 +2,7 @@
 
     python -m experiments.live                                            # starts a digital twin and serves a web page
     python -m experiments.live --sensor bench                             # the sensor of a sensor file
-    python -m experiments.live --camera URL --leds PORT --sensor bench    # replaces the device paths of the file
+    python -m experiments.live --camera URL --leds PORT --sensor bench    # other paths to the devices of the file
     python -m experiments.live --sensor bench --record runs/monday        # also records both streams
     python -m experiments.live --replay runs/monday --loop                # predicts from a recording
     python -m experiments.live --replay visual.mp4 tactile.mp4 --sensor bench
@@ -197,7 +197,7 @@ def images(config: Config, source: Source) -> Iterator[hardware.Shot]:
 
 
 class Screen:
-    """Shows the newest images and predictions on the page or in the terminal, and writes them to the `--save` file."""
+    """Shows the images and predictions on the page, or a line of text in the terminal, and writes the `--save` file."""
 
     def __init__(self, config: Config, source: Source, views: Views, page: LivePage | None):
         """Prepare the outputs.

@@ -318,6 +318,15 @@ def test_the_identity_of_a_dataset_follows_from_its_files(folder, copied):
     assert dataset.load(copied).identity != dataset.load(folder).identity
 
 
+def test_the_split_of_an_existing_dataset_is_kept(copied):
+    path = copied / "split.json"
+    split = json.loads(path.read_text())
+    other = {**split, "train": split["test"], "test": split["train"]}
+    path.write_text(json.dumps(other))
+    dataset.collect(SMALL, sts.Sensor(), copied)
+    assert json.loads(path.read_text()) == other
+
+
 def test_a_folder_that_another_process_collects_into_is_refused(copied):
     with storage.lock(copied), pytest.raises(storage.LockedError, match="copy is in use by process"):
         dataset.collect(SMALL, sts.Sensor(), copied)

@@ -24,6 +24,19 @@ def test_the_split_of_published_collections_is_unchanged():
     assert split["test"].tolist() == [2, 3, 8, 9]
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_classes_of_different_sizes_have_equal_proportions_in_all_parts(seed):
+    labels = ("mug",) * 100 + ("bowl",) * 10 + ("fork",)
+    meshes = dataset.Meshes("meshes", tuple(f"{i}.stl" for i in range(111)), labels, "")
+    split = dataset.split_objects(dataset.Collection(meshes=meshes, num_objects=111, seed=seed))
+    assert {name: len(part) for name, part in split.items()} == {"train": 78, "validation": 11, "test": 22}
+    np.testing.assert_array_equal(np.sort(np.concatenate(list(split.values()))), np.arange(111))
+    for part, share in zip(split.values(), (0.7, 0.1, 0.2), strict=True):
+        for name, number in (("mug", 100), ("bowl", 10)):
+            assert abs(sum(labels[i] == name for i in part) - share * number) <= 1
+    assert 110 in split["train"]  # the only object of its class
+
+
 def test_classes_follow_the_categories():
     collection = dataset.Collection(categories=("fork", "bottle"), num_objects=20)
     names = dataset.class_names(collection)

@@ -58,7 +58,7 @@ class Lights:
         return found, mean
 
     def off_after(self, time_s: float) -> float | None:
-        """Return the time at which the lights went off, or `time_s` if `time_s` is later.
+        """Return a time from which the lights have been off, not earlier than `time_s`.
 
         Return None if the lights are on now. All times are in seconds on `time.monotonic`.
         """

@@ -26,7 +26,7 @@ from sts_jax.dataset.collection import (
 )
 from sts_jax.dataset.rendering import render
 from sts_jax.sensor import Sensor
-from sts_jax.storage import claim, digest, lock, read_json
+from sts_jax.storage import claim, digest, lock, read_json, write_json
 
 
 class Collected(NamedTuple):
@@ -76,8 +76,8 @@ def collect(
     Raises:
         ValueError: A constant of the sensor or a field of the collection is out of range, the pad is not square but the
             symmetries of the collection need a square pad, or no object of a shard can be simulated. The error is also
-            raised if `collection.json`, `sensor.json` or `split.json` in the folder is from another collection, sensor
-            or format. The message names the constant, the field or the file.
+            raised if `collection.json` or `sensor.json` in the folder is from another collection, sensor or format. The
+            message names the constant, the field or the file.
         ImportError: `collection.parts` or a mesh file needs a package that is not installed.
         LockedError: Another process collects into the folder.
         DamagedFileError: A file in the folder is damaged, or a file of a shard belongs to another dataset or shard. The
@@ -99,10 +99,9 @@ def _collect(
         records.check_format(read_json(path, f"delete {folder} and collect again"), folder)
     claim(path, description)
     claim(folder / "sensor.json", constants)
-    claim(
-        folder / "split.json",
-        {name: [int(i) for i in part] for name, part in split_objects(collection).items()},
-    )
+    split = folder / "split.json"
+    if not split.exists():  # the split of an older version of this library is kept
+        write_json(split, {name: [int(i) for i in part] for name, part in split_objects(collection).items()})
     made = Collected(0, ())
     for index in range(collection.num_shards):
         identity = records.Identity(digest(description), digest(constants), index)

@@ -161,19 +161,24 @@ def split_objects(collection: Collection) -> dict[str, np.ndarray]:
     """Split the objects of a collection into parts for training, validation and test.
 
     The sizes of the parts follow from `collection.shares`. The split is random and depends on `collection.seed`. Each
-    part has nearly the same proportions of the classes.
+    part has nearly the same proportions of the classes, also if the classes have different numbers of objects.
 
     Returns:
         Sorted indices of the objects, int `(n,)`, for each of `train`, `validation` and `test`.
     """
     rng = np.random.default_rng([collection.seed, 1])
-    # Each block has one object of every class that is not used up, so the parts have equal proportions of the classes.
     names = np.array(class_names(collection))
     members = [rng.permutation(np.flatnonzero(names == name)) for name in dict.fromkeys(names.tolist())]
-    blocks = [rng.permutation([m[i] for m in members if i < len(m)]) for i in range(max(map(len, members)))]
+    # Each part consists of successive blocks. The objects of each class are spread evenly over the blocks, so the parts
+    # have equal proportions of the classes.
+    blocks: list[list[int]] = [[] for _ in range(max(map(len, members)))]
+    for own in members:
+        for i, index in enumerate(own.tolist()):
+            # A class that lacks one object fills the first blocks, as in datasets that exist already.
+            blocks[i if len(own) >= len(blocks) - 1 else (2 * i + 1) * len(blocks) // (2 * len(own))].append(index)
+    order = np.concatenate([rng.permutation(block) for block in blocks])
     cuts = np.round(np.cumsum(collection.shares)[:-1] * collection.num_objects).astype(int)
-    parts = np.split(np.concatenate(blocks), cuts)
-    return {name: np.sort(part).astype(np.int64) for name, part in zip(PARTS, parts, strict=True)}
+    return {name: np.sort(part).astype(np.int64) for name, part in zip(PARTS, np.split(order, cuts), strict=True)}
 
 
 def symmetries_of(collection: Collection) -> tuple[int, ...]:

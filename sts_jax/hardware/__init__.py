@@ -1,4 +1,4 @@
-"""The real sensor: camera, LED controller, calibration, and recording. This package uses NumPy, not JAX."""
+"""The real sensor: camera, LED controller, calibration, and recording. Only its digital twin, `twin`, uses JAX."""
 
 from sts_jax.hardware.board import Board, FoundCorners, board_image, find_board, save_board
 from sts_jax.hardware.calibration import Calibration, CalibrationError, calibrate, fit_lens

@@ -41,7 +41,8 @@ class _Problem:
 class Grabber:
     """The thread that fetches the frames of a camera.
 
-    It runs from the call of `Camera.connect` to the call of `Camera.disconnect`.
+    It runs from the call of `Camera.connect` to the call of `Camera.disconnect`, or to an earlier end of the video file
+    or an error after which the camera cannot be used any more.
 
     Only this thread opens, reads and closes the source, which is a device, a network stream or a video file. While the
     thread runs, no other `Camera` can use the device or the network stream.

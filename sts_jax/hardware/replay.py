@@ -227,7 +227,8 @@ class Replay:
             StaleFrameError: No pair is available yet. Or the newest pair is older than `max_age_ms`, and more pairs
                 follow.
             EndOfVideoError: The newest pair is older than `max_age_ms`, and no more pairs follow.
-            CameraError: The recording contains no pair, for example because it has images of one stream only.
+            CameraError: `speed` is a number, and the recording contains no pair, for example because it has images of
+                one stream only.
             DamagedFileError: An image of the recording is damaged.
         """
         if not max_age_ms > 0:

@@ -385,7 +385,7 @@ class STS:
         beginning of this period. The limit is 8 times the median difference over all blocks, but at least 6.
 
         Args:
-            timeout_s: Longest time from the first image to the returned one (s).
+            timeout_s: Time after the first image at which the method gives up (s).
             window_s: Time during which the view must not change (s).
 
         Returns:
@@ -502,7 +502,7 @@ def first_still(shots: Iterable[Shot], timeout_s: float, window_s: float) -> Sho
 
     Args:
         shots: Successive images of the visual stream.
-        timeout_s: Longest time from the first image to the returned one (s).
+        timeout_s: Time after the first image at which the function gives up (s).
         window_s: Time during which the view must not change (s).
 
     Raises:

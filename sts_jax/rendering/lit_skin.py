@@ -30,7 +30,7 @@ def lit_skin(
 
     Returns:
         Red, green and blue channel, not clipped to [0, 1]. Each channel has two rows and two columns less than
-        `imprint`, because the outermost rays are only used to compute the normals at the neighbouring rays.
+        `imprint`, because the normal at a ray is computed from the neighbouring rays.
     """
     coupled = sensor.skin.coupling > 0
     imprint = jax.lax.cond(coupled, tactile.couple, lambda *given: given[0], imprint, sensor.skin.coupling, pitch)

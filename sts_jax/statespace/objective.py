@@ -245,10 +245,13 @@ def loss(
         beta: Weight of the Kullback-Leibler divergence of the appearance code from its prior.
 
     Returns:
-        The loss, and its terms by name without their weights. A term that depends on inputs is a mean over the items
-        that have these inputs. Each of the terms `state`, `doubt` and `first` is a sum of such means, one mean for each
-        image input of the model. The term `covered` is the sum of a mean for the first frame and a mean for the last
-        frame. The term `state` is a squared error of state codes, and all other terms are in nats.
+        The loss, and its terms by name without their weights. Terms are means over items, and items without an input do
+        not count in the terms of this input. The terms `state` and `doubt` are sums of one mean for each image input of
+        the model. The term `first` is a sum of one mean for each image input, or the mean for the views if `views` is
+        given. Only a part of the batch is rendered: the terms of first frames or
+        views include the share `Config.drawn_first`, and the terms of last frames the share `Config.drawn`.
+        The term `covered` is the sum of a mean for the first frame and a mean for the last frame. The term `state` is a
+        squared error of state codes, and all other terms are in nats.
     """
     model = nnx.merge(graphdef, params)
     config = model.config
