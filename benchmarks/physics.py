@@ -8,9 +8,9 @@
 
 All commands print their results. Only `--scaling` writes files.
 
-- Without an option, the command measures steps per second of MJX and of C MuJoCo's batch function (`mujoco.rollout`),
-  both on all cores and from the same initial poses. The command first drops an object with one hull of 32 vertices,
-  then one object of each of the eight classes, with hulls of up to 64 vertices.
+- Without an option, the command measures steps per second of MJX and of C MuJoCo's batch function (`mujoco.rollout`)
+  from the same initial poses. MJX uses two threads, and `mujoco.rollout` uses all cores. The command first drops an
+  object with one hull of 32 vertices, then one object of each of the eight classes, with hulls of up to 64 vertices.
 - `--engines N` measures falls per second of both engines of `simulate` (MJX and C MuJoCo), for N falls of each of 16
   objects. MJX simulates `--chunk` falls at once, and needs a larger `--chunk` on a GPU than on a CPU.
 - `--pipeline N` drops a bottle N times, renders a visual and a tactile image of every frame (64x64, uint8), and fetches

@@ -85,6 +85,7 @@ class Peer:
         for descriptor in (self._master, self._slave):
             with contextlib.suppress(OSError):
                 os.close(descriptor)
+        self._master = self._slave = -1  # the system may give the old numbers to other files
         self.path.unlink(missing_ok=True)
 
     def send(self, data: bytes) -> None:

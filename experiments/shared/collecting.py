@@ -149,6 +149,8 @@ def of_twin(config: Collect) -> simulated.Simulated:
     for name, value in devices.items():
         if value is not None:
             raise ValueError(f"--{name} is {value}, but no device is used with --twin: leave out --{name} or --twin")
+    if not config.lock:
+        raise ValueError("--no-lock is given, but no device is used with --twin: leave out --no-lock or --twin")
     default = simulated.Simulated(config.workdir)
     return simulated.Simulated(
         config.workdir,

@@ -22,7 +22,8 @@ class Extensions:
     of a metric's function, rename the metric.
 
     Raises:
-        ValueError: Two metrics have the same name, or a column uses a metric that is not in `metrics`.
+        ValueError: Two metrics have the same name, or a column uses a metric that is neither in `metrics` nor the error
+            of a modality in `measurements`.
     """
 
     # Function that receives the configuration of a model, and returns the loss for it

@@ -199,10 +199,11 @@ def _scored(
 
 
 def main_rows(model: str, titles: Sequence[str]) -> list[str]:
-    """Titles of the main table's rows: ceiling, baselines, and one row for each set of inputs of the main model.
+    """Titles of the main table's rows: the ceiling, the baselines, and up to five rows of the main model.
 
     The row of the ceiling has the scores of a prediction that averages over re-rolls. A re-roll is another simulation
-    from the same initial state, with new random hidden properties such as friction.
+    from the same initial state, with new random hidden properties such as friction. Each row of the main model is for
+    one set of inputs.
 
     Args:
         model: Title of the main model.

@@ -47,6 +47,7 @@ class Simulated:
             raise ValueError(f"count must be >= 1, got {self.count}")
         if min(self.size) < 1:
             raise ValueError(f"size is {self.size}, but width and height must be at least 1 pixel")
+        hardware.sts.checked_levels(self.levels)
 
 
 class Hand(twin.Hand):

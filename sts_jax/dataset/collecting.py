@@ -43,8 +43,8 @@ class Progress(NamedTuple):
     then renders their images, and then continues with the next shard.
     """
 
-    done: int  # finished trajectories of the dataset, or finished images of the current shard
-    total: int  # all trajectories of the dataset, or all images of the current shard
+    done: int  # finished trajectories of the dataset, or finished frames and views of the current shard
+    total: int  # all trajectories of the dataset, or all frames and views of the current shard
     stage: str  # "trajectories" for the simulation, "frames" for the rendering
 
 

@@ -31,8 +31,8 @@ class Replay:
 
     The replay imitates the timing of the sensor. An image that arrived 2 s after the beginning of the recording becomes
     available 2 s after `connect`. With `speed=2`, it becomes available after 1 s. A program that reads too slowly
-    misses images, as with a sensor, and `skipped` counts them. With `speed=None`, the replay waits for the program
-    instead and returns every image.
+    misses images, as with a sensor. With `speed=None`, the replay waits for the program instead, and `stream` returns
+    every image.
 
     The times in each returned `Shot` are times of the replay on the clock `time.monotonic`, not the recorded times. The
     time between two images of the replay is the time between them in the recording, divided by `speed`. A replay cannot
@@ -40,7 +40,8 @@ class Replay:
     use a replay.
 
     Attributes:
-        skipped: Number of images since `connect` that were not returned because the program read too slowly.
+        skipped: Number of images since `connect` that `stream`, `async_read` and `read_latest` left out because the
+            program read too slowly.
     """
 
     def __init__(

@@ -307,7 +307,7 @@ class STS:
         return self._connected.pair(time.monotonic() + self._limit_s(timeout_ms, 2))
 
     def async_read(self, timeout_ms: float | None = None) -> Pair:
-        """Return the newest pair of images that has not been returned yet, or wait for the next pair.
+        """Return the newest pair of images that this method has not returned yet, or wait for the next pair.
 
         The first call starts a thread that takes pairs continuously, until `read`, `stream`, `wait_until_still` or
         `disconnect` is called. An error ends the thread. The first call of `async_read` or `read_latest` after the
