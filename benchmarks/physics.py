@@ -349,7 +349,7 @@ def first_call(name: str, count: int) -> dict[str, Any]:
 
     Returns:
         A dict. `seconds`: duration of the first call minus duration of the second call (s). `objects`: number of
-        used objects. `programs`: number of compilations of each compiled function of `simulate` for these objects.
+        used objects. `programs`: number of compilations of the four main functions of `simulate` for these objects.
     """
     scenario, sensor, items = SCENARIOS[name], Sensor(), bodies(objects.CATEGORIES, count)
     items = [body for body in items if physics.refusal(body, scenario) is None]

@@ -197,7 +197,7 @@ def embree(body: objects.Body, poses: jax.Array, shape: tuple[int, int]) -> dict
 
 
 def median_seconds(*works: Callable[[], object], repeats: int = 7) -> list[float]:
-    """Median seconds of each function. The functions are called in alternation, `repeats` times each."""
+    """Median seconds of each function. All functions are called in turn, and this is repeated `repeats` times."""
     return np.median(in_turn(*works, repeats=repeats), axis=0).tolist()
 
 

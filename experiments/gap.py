@@ -11,8 +11,9 @@ real sensor and of the digital twin. Raw images are rectified with the calibrati
 default, a real and a simulated trajectory with the same number must show the same object in the same poses. Give
 `--match none` if the two folders show the same object in different poses.
 
-The command prints differences per pixel, the distance between the distributions of real and simulated images in a
-feature space, and the accuracy of a classifier that tries to distinguish real from simulated images. The command
+The command prints the distance between the distributions of real and simulated images in a feature space, and the
+accuracy of a classifier that tries to distinguish real from simulated images. With `--match number`, the default, it
+also prints differences per pixel. The command
 writes the printed text and a figure of the images to the folder `--out`. The command takes about a minute for 40
 trajectories. The classifier needs scikit-learn (`pip install -e '.[bench]'`).
 """

@@ -112,7 +112,7 @@ def checked_measurements(measurements: Any, reserved: tuple[str, ...]) -> dict[s
         reserved: Names of the modalities that have an argument of their own.
 
     Raises:
-        ValueError: `measurements` is not a dictionary, or has a name in `reserved`.
+        ValueError: `measurements` is not a dictionary, or has values with a name in `reserved`.
     """
     if not isinstance(measurements, Mapping | None):
         raise ValueError(

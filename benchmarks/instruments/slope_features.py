@@ -52,9 +52,9 @@ def margins(corners: np.ndarray, place: np.ndarray) -> list[float]:
 
     Returns:
         Four numbers. The first is the distance from the nearest edge (m). The other three describe the nearest edge
-        that faces downhill (+y), or the nearest edge if none faces downhill. They are the distance from this edge (m),
-        its length (m), and the y component of its outward unit normal. Distances are positive inside of the polygon and
-        negative outside.
+        whose outward normal has a y component above 0.2 (+y is downhill), or the nearest edge if there is no such edge.
+        They are the distance from this edge (m), its length (m), and the y component of its outward unit normal.
+        Distances are positive inside of the polygon and negative outside.
     """
     along = np.roll(corners, -1, 0) - corners
     length = np.linalg.norm(along, axis=1) + 1e-9

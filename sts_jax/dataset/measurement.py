@@ -83,8 +83,8 @@ def measured(
 
     Raises:
         ValueError: Two measurements have the same name. The function `measure` or `turn` returns a wrong shape or type,
-            infinite numbers, or image values outside [0, 1]. Copies are requested, but a measurement has no function
-            `turn`.
+            infinite numbers (NaN is allowed), or image values outside [0, 1]. Copies are requested, but a measurement
+            has no function `turn`.
     """
     names = [own.name for own in measurements]
     if len(set(names)) < len(names):

@@ -1,4 +1,4 @@
-"""Markdown tables of a summary: `table` with the main metrics and `full_table` with all metrics."""
+"""Markdown tables of a summary: `table` with the main metrics, and `full_table` with further metrics."""
 
 from collections.abc import Sequence
 
@@ -41,6 +41,8 @@ def table(
 
 def full_table(summary: dict, *, title: str, notes: Sequence[str] = (), metrics: Sequence[Metric] = METRICS) -> str:
     """Format all metrics as a Markdown table, followed by a table of the differences from the baselines.
+
+    Metrics whose field `column` is False are left out.
 
     Args:
         summary: The result of `summarise`.

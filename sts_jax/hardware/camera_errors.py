@@ -42,7 +42,7 @@ class FrozenCameraError(CameraError):
 
 
 class StaleFrameError(CameraError):
-    """The newest frame is older than the caller allows."""
+    """The newest frame is older than the caller allows, or there is no frame yet."""
 
 
 class EndOfVideoError(CameraError):
