@@ -76,7 +76,10 @@ class Args:
         if self.number < 1:
             raise ValueError(f"--number must be at least 1, got {self.number}")
         if not 0 <= self.long <= 1:
-            raise ValueError(f"--long is the share of long faults and must be in [0, 1], got {self.long}")
+            raise ValueError(
+                f"--long is the share of the long ones among faults of random duration, and must be in [0, 1], got "
+                f"{self.long}"
+            )
         if unknown := set(self.only) - set(KINDS) - {KILLED}:
             raise ValueError(
                 f"--only has unknown kinds {sorted(unknown)}, but each kind must be one of: "

@@ -94,7 +94,7 @@ def stepper(model: mvae.Config, size: int, absent: tuple[str, ...]) -> Callable[
 
 
 def predictor(size: int) -> Callable[[], None]:
-    """Make a function that predicts all modalities of `MODEL` for a batch of visual images, in one compiled call.
+    """Make a function that predicts all modalities of `MODEL` for a fixed batch of visual images, in one compiled call.
 
     Args:
         size: Batch size.

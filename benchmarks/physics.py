@@ -180,7 +180,7 @@ def compare_speed(name: str, items: list[objects.Body], num: int) -> None:
 
 
 def engines(num: int, chunk: int) -> None:
-    """Measure how many falls per second each engine of `simulate` computes for 16 objects, and print the rates.
+    """Measure how many falls of 16 objects per second each engine of `simulate` computes, and print the two rates.
 
     Args:
         num: Number of falls of each object.

@@ -77,7 +77,7 @@ def train(
         seed: Seed of the weights and of the order of the batches.
 
     Returns:
-        The number of training trajectories, and the duration of the training in minutes.
+        The number of training trajectories, and the time of all steps in minutes, without compilation.
     """
     pairs, views = data.pairs(data.members("train")), data.views("train")
     falls = data.ends(data.members("train", rendered=False))

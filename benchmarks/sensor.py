@@ -405,7 +405,7 @@ def cost_of(faces: int, height: int, width: int) -> dict[str, float]:
 def cost() -> None:
     """Measure the time and the peak memory of rendering a frame, for several image sizes and numbers of faces.
 
-    Each combination is measured in a new process. The results are printed, and the times are plotted.
+    Each measurement runs in a new process. The results are printed, and the times are plotted.
     """
 
     def measured(faces: int, shape: tuple[int, int]) -> dict[str, float]:

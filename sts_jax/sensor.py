@@ -102,7 +102,7 @@ class Sensor:
         return jax.tree.unflatten(structure, [safe(*pair) for pair in zip(leaves, known, strict=True)]), sound
 
     def constants(self) -> dict[str, Any]:
-        """All constants as nested dictionaries of lists and numbers, as in the file that `save` writes."""
+        """All constants as nested dictionaries with JSON values, as in the file that `save` writes."""
         return _plain(self)
 
     def save(self, path: str | os.PathLike) -> None:

@@ -362,3 +362,20 @@ def test_many_pairs_have_no_wrong_or_mixed_light(tmp_path, lag_s):
             assert all(judged(peer, shot) for _ in range(120) for shot in _both(sensor.read()))
     finally:
         peer.stop()
+
+
+def test_each_reconnection_during_a_pair_extends_its_deadline(sensor, monkeypatch):
+    """The controller is lost in the second image, and the images before and after the loss form no pair."""
+    frames, pair, deadlines = sensor._frames, sensor.read(), []
+
+    def shot(stream, deadline, **options):
+        deadlines.append(deadline)
+        found = getattr(pair, stream)
+        if len(deadlines) == 2:
+            frames._lost_s += 5.0
+            return dataclasses.replace(found, epoch=found.epoch + 1)
+        return found
+
+    monkeypatch.setattr(frames, "shot", shot)
+    assert set(map(id, _both(frames.pair(100.0)))) == set(map(id, _both(pair)))
+    assert deadlines == [100.0, 100.0, 105.0, 105.0]

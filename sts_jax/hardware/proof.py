@@ -175,7 +175,7 @@ class ProvenFrames:
         """Take a visual and a tactile image. The frames of both images arrive after the start of this call.
 
         The method begins with the stream for which the lights are already set. The lights are therefore switched only
-        once for a pair.
+        once for a pair, unless a connection is lost.
 
         Args:
             deadline: Time on the clock `time.monotonic` at which the wait for frames ends (s). If the LED controller is
@@ -192,10 +192,11 @@ class ProvenFrames:
         while True:
             lost_s = self._lost_s
             one = self.shot(first, deadline, after_s=time.monotonic(), then=second)
-            deadline += self._lost_s - lost_s
+            deadline, lost_s = deadline + self._lost_s - lost_s, self._lost_s
             two = self.shot(second, deadline)
             if one.epoch == two.epoch and one.before.boot == two.before.boot:
                 return Pair(one, two) if first == "visual" else Pair(two, one)
+            deadline += self._lost_s - lost_s
 
     def shot(self, stream: Stream, deadline: float, *, after_s: float = 0.0, then: Stream | None = None) -> Shot:
         """Take an image of one stream.

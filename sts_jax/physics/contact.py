@@ -10,7 +10,8 @@ of a box are called its rims. The contacts of a convex hull with such a box can 
 three of these kinds:
 
 - A vertex of the hull lies inside the box. The vertex is pushed out through the nearest of the top and the four sides.
-- An edge of the hull crosses a rim. The edge is pushed along the common normal of edge and rim.
+- An edge of the hull crosses a rim. The edge is pushed along the common normal of edge and rim, or upwards if this
+  normal points into the box.
 - A corner of the top lies inside the hull. The hull is pushed along the normal of the nearest lower face of the hull.
 
 The distance of each contact is exact along its normal. The fourth kind is left out: an edge of the hull crosses one of

@@ -6,7 +6,8 @@ properties that the images show.
 
 - An encoder for each kind of image (visual and tactile) returns a Gaussian over both codes. The belief is the product
   of the prior and the Gaussians of all inputs (`objective.fuse`).
-- The transition maps the belief to a density of the final pose and of the rotation from the first to the final pose.
+- The transition maps the belief about the state code to a density of the final pose and of the rotation from the first
+  to the final pose. The known quantities of the trajectory (its condition) are a second input.
 - The decoder renders both images of an object in a given pose, from the latent and the rotation since the first frame.
 
 All convolutions have stride 1, for which XLA's CPU backend is fast. To reduce an image, blocks of pixels are folded

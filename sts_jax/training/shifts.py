@@ -12,9 +12,10 @@ def shifted(
     The function subtracts the image of the empty pad, shifts the difference, and adds the image of the empty pad again.
     The light on the empty pad therefore stays in place.
 
-    The result is exact for points on the pad under distant lights. For a point at the height z above the pad, the shift
-    is too large by the factor 1 + z / d, where d is the distance from the camera to the pad. If the border of the image
-    cuts off a part of an object, this part is missing after the shift, too.
+    The result is exact for points on the pad under distant lights, except for the vignetting of visual images. For a
+    point at the height z above the pad, the shift is too large by the factor 1 + z / d, where d is the distance from
+    the camera to the pad. If the border of the image cuts off a part of an object, this part is missing after the
+    shift, too.
 
     Args:
         images: First and last image of each of n trajectories, all visual or all tactile.
