@@ -331,7 +331,7 @@ def summarise(live: Live, sensor: hardware.STS | hardware.Replay, duration_s: fl
 
 
 def main(config: Config) -> None:
-    """Load the model, connect the sensor, open the web page, and predict until the images end or a user quits."""
+    """Load the model, and show predictions until the images end, the time `--seconds` is over, or a user quits."""
     with errors.on_one_line(debug=config.debug):
         try:
             check(config)

@@ -262,17 +262,18 @@ def lock(folder: Path) -> Iterator[None]:
         OSError: The folder cannot be created or written to.
     """
     owner, held = folder / OWNER, filelock.FileLock(folder / ".lock", timeout=0)
+    this = f"process {os.getpid()} on {platform.node()}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         held.acquire()
-        owner.write_text(f"process {os.getpid()} on {platform.node()}")
+        owner.write_text(this)
     except filelock.Timeout:
         holder = "another process"
         with contextlib.suppress(OSError):  # the holder may not have written it yet, or may have just finished
             holder = owner.read_text(errors="replace") or holder
-        raise LockedError(
-            f"{folder} is in use by {holder}: wait until that process has finished, or choose another folder."
-        ) from None
+        own = holder == this
+        remedy = "close what uses the folder in this process" if own else "wait until that process has finished"
+        raise LockedError(f"{folder} is in use by {holder}: {remedy}, or choose another folder.") from None
     except OSError as error:
         held.release()
         raise OSError(f"cannot create or write to {folder}: {error}. Choose a folder you can write to.") from error

@@ -84,9 +84,9 @@ def read(config: Config, workdir: Path) -> Recorded:
 
     Raises:
         FileNotFoundError: The work directory has no `dataset/session.json`, or no sensor file.
-        ValueError: There are too few trajectories. Or the sensor file is invalid, names no background images (images of
-            the empty pad), or does not fit the images. Or a background image is missing or damaged.
-        OSError: Another file is damaged.
+        ValueError: There are too few trajectories. Or the content of the sensor file is invalid, names no background
+            images (images of the empty pad), or does not fit the images. Or a background image is missing or damaged.
+        OSError: A file cannot be read, or is damaged.
     """
     recordings = hardware.load_recordings(workdir / "dataset")
     device, sensor = sensor_file(workdir)

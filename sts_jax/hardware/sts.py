@@ -481,7 +481,7 @@ def stream_order(duty: float, dwell: int) -> Iterator[Stream]:
         ValueError: An argument is out of range.
     """
     if not 0 <= duty <= 1:
-        raise ValueError(f"duty must be in [0, 1], got {duty}")
+        raise ValueError(f"duty, the share of tactile images, must be in [0, 1], got {duty}")
     if dwell < 1:
         raise ValueError(f"dwell must be >= 1, got {dwell}")
 

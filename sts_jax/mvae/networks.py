@@ -303,10 +303,10 @@ class MVAE(nnx.Module):
 def init(key: PRNGKeyArray, config: Config) -> tuple[nnx.GraphDef[MVAE], nnx.State, nnx.State]:
     """Create a model with random parameters.
 
-    Kernels are drawn from normal distributions with variance `1 / fan_in`. Only the first 16 components of the latent
-    are active at the start. The weights that belong to the other components are multiplied by 0.03, so that these
-    components start near the prior. The kernel of the last layer of an image decoder is multiplied by 0.1. The biases
-    of hidden layers are 0, and the scales of batch normalisation are 1.
+    Kernels are drawn from normal distributions with variance `1 / fan_in`, where `fan_in` counts only the active
+    inputs. Only the first 16 components of the latent are active at the start. The weights that belong to the other
+    components are multiplied by 0.03, so that these components start near the prior. The kernel of the last layer of an
+    image decoder is multiplied by 0.1. The biases of hidden layers are 0, and the scales of batch normalisation are 1.
 
     Args:
         key: Random key for the kernels.

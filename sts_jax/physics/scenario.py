@@ -220,9 +220,9 @@ class Scenario(abc.ABC):
 
     @property
     def vectors(self) -> int:
-        """Number of vectors (x, y) in a trajectory's condition, which describes the motion or the tilt of the pad.
+        """Number of vectors (x, y) among the known quantities of a trajectory, which are called its condition.
 
-        The property `quantities` lists the vectors and the scalars of the condition. The vectors come first.
+        The field `quantities` lists the vectors and the scalars of the condition. The vectors come first.
         """
         return sum(quantity.vector for quantity in self.quantities)
 
