@@ -111,7 +111,7 @@ def test_reviewing_waits_for_the_end_of_collecting(tmp_path):
         add(session)
         with pytest.raises(storage.LockedError, match="is in use by"):
             hardware.discard_recording(tmp_path, 0)
-        with pytest.raises(storage.LockedError, match="is in use by .*: close what uses the folder in this process"):
+        with pytest.raises(storage.LockedError, match=r"is in use by .*: close what uses the folder in this process"):
             Session.open(tmp_path, ORIGIN)
 
 
