@@ -6,8 +6,8 @@
     python -m benchmarks.device --pairs 10 --lags-ms 15
 
 A pair is a visual image (light off) and a tactile image (light on). No hardware is needed. A separate process emulates
-the LED controller on a pseudo-terminal and the camera on a local network port. The emulated images are of one colour
-(`instruments/sensor_peer.py`). With `--twin` they are images of the digital twin (`instruments/twin_peer.py`), whose
+the LED controller on a pseudo-terminal and the camera on a local network port. The emulated images are of one colour,
+except for a corner that shows the number of the frame (`instruments/sensor_peer.py`). With `--twin` they are images of the digital twin (`instruments/twin_peer.py`), whose
 object is held or released after every ten pairs.
 
 The lag of a camera is the time from the end of a frame's exposure to the sending of the frame. The emulated camera has

@@ -155,14 +155,14 @@ def record(device: twin.Twin, folder: Path, count: int, note: str, bar: Bar) -> 
         The pose of the object (7 numbers) for each pair, from the twin's log.
 
     Raises:
-        ValueError: The folder has trajectories already.
+        ValueError: The folder has confirmed trajectories already.
     """
     poses = []
     with recording(folder, note) as session:
         if session.confirmed:
             raise ValueError(
-                f"the number of trajectories in {folder} must be 0, got {session.confirmed}: delete the folder, or "
-                "choose another --workdir"
+                f"the number of confirmed trajectories in {folder} must be 0, got {session.confirmed}: delete the "
+                "folder, or choose another --workdir"
             )
         for done in range(count):
             bar(note, done, count)
@@ -255,7 +255,7 @@ def changed(clean: gap.Streams, difference: Difference, resolution: tuple[int, i
     """Change clean images as an imperfect camera would: add imperfections, distort and resize the images.
 
     Args:
-        clean: Images of a twin without imperfections, at the resolution of the twin's camera, uint8.
+        clean: Images of a twin that has almost no imperfections, at the resolution of the twin's camera, uint8.
         difference: The imperfections to add, and whether the images are distorted as by a fisheye lens.
         resolution: Height and width of the result (pixels).
         seed: Seed of the noise.

@@ -436,7 +436,7 @@ def cost() -> None:
 
 
 def compilations(number: int = 100) -> None:
-    """Print how often `sense` compiles for `number` different objects, both procedural ones and public meshes."""
+    """Print how often `sense` compiles for `number` objects: all public meshes, and random procedural objects."""
     files = sorted(public_meshes().glob("*.obj"))
     bodies = []
     with warnings.catch_warnings():

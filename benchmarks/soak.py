@@ -12,7 +12,7 @@ command also counts the trajectories that `simulate` discarded and replaced by n
 because the object sank deeper into the pad than `physics.simulation.SUNK_LIMIT`.
 
 The command compares the wrench at rest with the weight. For the frames without contact, it compares the energy of the
-object with the energy at the start. All results are printed.
+object with the energy at the start, except in `perturbed`, where gravity changes. All results are printed.
 
 The trajectories are simulated in blocks of 504, or of fewer if fewer are requested. `benchmarks.hidden --soaked FOLDER`
 analyses the blocks that `--keep FOLDER` has kept.

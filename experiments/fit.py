@@ -133,7 +133,7 @@ def slope(
     *,
     resolution: tuple[int, int],
 ) -> Slope:
-    """Compute the loss of the moved object's image, and the derivatives of the loss with respect to the move.
+    """Compute the loss of the moved object's image, and the derivatives of half the loss with respect to the move.
 
     The loss is the mean of the squared values of the blurred difference between the image and the target. The depth and
     the tilt of the moved object are computed from the balance of forces in the gel. The derivatives treat the depth and

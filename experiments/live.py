@@ -277,7 +277,7 @@ class Screen:
 
 
 def follow(config: Config, source: Source, predictor: sts.Predictor, page: LivePage | None) -> None:
-    """Connect the source, and process its images until the source ends or the user stops the command.
+    """Connect the source, and process its images until the source ends, `--seconds` is over or the user quits.
 
     The command shows the images, predicts from the newest images, and records the images if `--record` is given.
     """

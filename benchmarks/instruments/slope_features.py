@@ -95,7 +95,7 @@ def balance(
 
 
 def drawn_centres(body: objects.Body, scenario: physics.Inclined) -> np.ndarray:
-    """Centres of mass of a body with random fill levels and contents, in the mesh frame (m), `(DRAWS, 3)`."""
+    """Centres of mass of a body for random fill levels and places of the contents, mesh frame (m), `(DRAWS, 3)`."""
     if not body.contents_density:
         return np.tile(np.asarray(body.shell_com), (DRAWS, 1))
     hidden = jax.vmap(scenario.hidden)(jax.random.split(jax.random.key(0), DRAWS))

@@ -26,7 +26,7 @@ DARK: Levels = (0, 0, 0, 0)
 
 
 class Code(enum.IntEnum):
-    """Reason why the LED controller refused a request, such as a wrong checksum or an unknown command."""
+    """The reason why the LED controller refused a request, such as a wrong checksum or an unknown command."""
 
     CHECKSUM = 1  # the checksum of the line is wrong
     COMMAND = 2  # there is no such command

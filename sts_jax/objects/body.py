@@ -53,7 +53,7 @@ class Body:
     category: Int[Array, "*n"]  # Index into CATEGORIES, or -1 for an object of no category.
 
     def check(self) -> None:
-        """Raise an error unless the fields form a single body that can be rendered and simulated.
+        """Check that the fields form a single body with finite values and valid indices.
 
         The check needs concrete values, so it cannot run under `jit`.
 

@@ -19,9 +19,9 @@ rigid_of_draws = jax.jit(jax.vmap(objects.rigid, in_axes=(None, 0, 0, 0)))  # on
 
 
 class Rigid(NamedTuple):
-    """Mass properties and friction of n objects, as float64 arrays with one entry per object.
+    """Mass properties and friction in n trajectories, as float64 arrays with one entry per trajectory.
 
-    The entry of an object depends on its hidden properties, such as the filled share of its interior.
+    Trajectories of the same object differ in its hidden properties, such as the filled share of its interior.
     """
 
     mass: Float[np.ndarray, "n"]  # Mass (kg).

@@ -3,9 +3,9 @@
 A pose code is the position divided by `training.Preprocessing.position_scale`, then the nine entries of the rotation
 matrix, row by row. The rotation matrix maps the mesh frame to the sensor frame.
 
-The heading of an object is a horizontal direction that turns with the object. On a level pad, a rotation
-of the whole scene about the z axis changes neither gravity nor the plane of the pad. The networks therefore work in a
-coordinate frame whose x axis is the heading. They learn motions and images for all headings at once.
+The heading of an object is a horizontal direction that turns with the object. On a level pad, a rotation of the whole
+scene about the z axis changes neither gravity nor the plane of the pad. The transition and the decoder therefore work
+in a coordinate frame whose x axis is the heading. They learn motions and images for all headings at once.
 """
 
 import jax

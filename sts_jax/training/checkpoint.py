@@ -119,7 +119,7 @@ def restore(folder: Path, like: State) -> State | None:
 
 
 def verified(folder: Path) -> Path | None:
-    """Compare all files of a model with their checksums.
+    """Compare the configuration, the blank images and the current checkpoint of a model with their checksums.
 
     Args:
         folder: Folder of the model.

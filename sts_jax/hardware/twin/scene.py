@@ -69,7 +69,7 @@ class Scene(abc.ABC):
     def ends(self, seen: Seen, blender: Blender) -> Ends:
         """Return two images of the scene: one with the LEDs off, and one with the LEDs at full power.
 
-        The images show the scene in the state `seen`. They are rendered now unless `prepare` has rendered them before.
+        The images show the scene in the state `seen`. Images that were rendered before may be returned again.
 
         Args:
             seen: State of the scene, as `at` returns it.
