@@ -7,8 +7,8 @@
 
 A pair is a visual image (light off) and a tactile image (light on). No hardware is needed. A separate process emulates
 the LED controller on a pseudo-terminal and the camera on a local network port. The emulated images are of one colour,
-except for a corner that shows the number of the frame (`instruments/sensor_peer.py`). With `--twin` they are images of the digital twin (`instruments/twin_peer.py`), whose
-object is held or released after every ten pairs.
+except for a corner that shows the number of the frame (`instruments/sensor_peer.py`). With `--twin` they are images of
+the digital twin (`instruments/twin_peer.py`), whose object is held or released after every ten pairs.
 
 The lag of a camera is the time from the end of a frame's exposure to the sending of the frame. The emulated camera has
 several lags in turn, and `hardware.STS` reads an equal share of the pairs at each lag. At each lag, `hardware.STS` also

@@ -18,10 +18,9 @@ NOISE = 0.05  # standard deviation of the measured log mass, about 5 % of the ma
 
 
 class Sight(NamedTuple):
-    """Properties computed from the shapes of objects.
+    """Properties computed from the shapes of b objects.
 
-    The field `rigid` has the mass properties of each object at 17 fill levels of its interior, from empty to full. The
-    first index of each array is the number of the object.
+    The field `rigid` has the mass properties of each object at 17 fill levels of its interior, from empty to full.
     """
 
     profile: np.ndarray  # (b, 10) m: radius of the base, height, greatest radius, radii at seven heights
