@@ -339,7 +339,7 @@ def main(args: Args) -> None:
     each other and with changed copies. The command `python -m experiments.gap` can compare `device` with `clean`.
 
     Raises:
-        ValueError: An option is out of range, or the work directory contains trajectories already.
+        ValueError: An option is out of range, or the work directory contains confirmed trajectories already.
     """
     if args.trajectories < 2 * gap.FOLDS:
         raise ValueError(

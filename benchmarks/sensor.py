@@ -228,7 +228,7 @@ def frames(
 
 
 def speed() -> None:
-    """Print frames per second of `sense` and of the ray tracer Embree, with a row for each object and image size.
+    """Print frames per second of `sense` and of the ray tracer Embree, for several objects, meshes and image sizes.
 
     A second table has the share of the time that each stage of `sense` takes.
     """

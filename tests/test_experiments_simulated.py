@@ -1,5 +1,6 @@
 """`real collect --twin`, and the sensor file of a work directory."""
 
+import json
 import math
 
 import numpy as np
@@ -129,6 +130,17 @@ def test_a_work_directory_keeps_its_sensor_file(file, tmp_path):
     with pytest.raises(ValueError, match=r"sensor\.json differs from .*bench\.json.*choose another --workdir"):
         collecting.keep(file, workdir)
     assert hardware.Device.load(workdir).background(workdir, "tactile").mean() == 90
+
+
+def test_a_sensor_file_with_other_constants_is_refused(file, tmp_path):
+    workdir = tmp_path / "run"
+    workdir.mkdir()
+    collecting.keep(file, workdir)
+    content = json.loads(file.read_text())
+    content["gel"]["max_depth"] = 0.002
+    file.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"sensor\.json differs from .*bench\.json.*choose another --workdir"):
+        collecting.keep(file, workdir)
 
 
 def test_a_work_directory_of_a_device_is_not_continued_by_the_twin(file, tmp_path):

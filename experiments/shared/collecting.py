@@ -5,6 +5,7 @@ import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
+import sts_jax as sts
 from experiments.shared import simulated
 from experiments.shared.command import Folder
 from experiments.shared.page import Page
@@ -175,13 +176,14 @@ def keep(file: Path, workdir: Path) -> None:
 
     Raises:
         ValueError: The work directory already contains a sensor file with another content.
-        SensorFileError: A sensor file is damaged.
-        OSError: A file cannot be read or written.
+        SensorFileError: The content of a sensor file is invalid.
+        OSError: A file cannot be read or written, or is damaged.
     """
     file, copy = hardware.sensor_file.sensor_file(file), workdir / hardware.sensor_file.NAME
     device = hardware.Device.load(file)
     if copy.exists():
-        if hardware.Device.load(copy) != device:
+        constants, kept = (sts.Sensor.load(path).constants() for path in (file, copy))
+        if hardware.Device.load(copy) != device or kept != constants:
             raise ValueError(
                 f"{copy} differs from {file}, but one sensor file must describe all trajectories of a work directory: "
                 "choose another --workdir"

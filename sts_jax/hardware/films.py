@@ -270,7 +270,7 @@ class _Video:
     def __init__(self, path: str | os.PathLike):
         self._config = CameraConfig(Path(path), None, None)
         if self._config.kind != "file":
-            raise ValueError(f"{path} is not a file: give the path of a video file.")
+            raise ValueError(f"{path} is the name of a camera, but it must be the path of a video file.")
         self._reopen()
         assert self.capture.frame_count is not None  # `Capture` raises an error for a file without a number of frames
         self.count, self.rate = self.capture.frame_count, self.capture.rate

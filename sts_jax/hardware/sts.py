@@ -367,7 +367,8 @@ class STS:
                 Each switch costs the settling time.
 
         Returns:
-            The iterator. Each step waits for one image, for at most the sensor's `timeout_s`.
+            The iterator. Each step waits for one image, for at most the sensor's `timeout_s`. The time of a
+            reconnection does not count.
 
         Raises:
             ValueError: An argument is out of range.

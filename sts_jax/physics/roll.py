@@ -114,9 +114,10 @@ def _depth(points: Float[Array, "3 h"], model: mjx.Model) -> Float[Array, ""]:
 def step(model: mjx.Model, data: mjx.Data, hull: Hull, state: State, gravity: Float[Array, "3"]) -> State:
     """Advance a state by one time step.
 
-    The step adds the wrench of the pad on the object to the field `wrenches` of the state, or sets this field to 0 if
-    the pad does not push the object. This wrench is the total over all contacts with the pad, and its moment is about
-    the sensor's origin. If the scene has a stop wall, contacts with the wall are not part of the wrench.
+    The field `wrenches` of the state accumulates the wrenches of the pad on the object. Each step adds its own wrench,
+    or sets the field to 0 if the pad does not push the object. The wrench of a step is the total over all contacts with
+    the pad, and its moment is about the sensor's origin. If the scene has a stop wall, contacts with the wall are not
+    part of the wrench.
 
     An object that is held, or that has left the pad, does not move, and the field `wrenches` is 0.
 

@@ -1,6 +1,6 @@
 """Windows around the object in an image, aligned with the principal axes of its silhouette, and magnified.
 
-The silhouette is the set of all pixels that differ from the image of the empty sensor.
+The silhouette is the set of all pixels that differ from the image of the empty sensor by more than a shadow does.
 """
 
 from typing import NamedTuple
