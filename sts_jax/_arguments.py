@@ -1,4 +1,4 @@
-"""Checks of the arguments of `Predictor`. Each error message states the argument, its value and the remedy."""
+"""Checks of the arguments of `Predictor`. Each error message states the argument, the problem and the remedy."""
 
 import operator
 from collections.abc import Mapping

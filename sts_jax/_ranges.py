@@ -1,7 +1,8 @@
 """Allowed ranges of a dataclass's fields, declared in their metadata.
 
 `aspect: float = dataclasses.field(default=4 / 3, metadata=POSITIVE)` declares that every number of the field must be
-> 0. The metadata's keys are "above" (>), "at_least" (>=), "below" (<) and "at_most" (<=).
+> 0. The metadata's keys are "above" (>), "at_least" (>=), "below" (<), "at_most" (<=), "whole" (a whole
+number) and "static" (JAX compiles a program for each value).
 
 `limits` compares the numbers of one field with the limits in its metadata. `check` raises an error if a field of a
 dataclass violates its limits.

@@ -57,7 +57,7 @@ class Sensor:
 
         - The distance from the pinhole to the gel's inner face is at least `camera.near`, the smallest depth at which
           objects are drawn. All objects that press on the gel are therefore drawn.
-        - `gel.max_depth`, the largest depth of the imprint, is at most `gel.thickness`.
+        - `gel.max_depth`, the largest depth of the imprint in an equilibrium, is at most `gel.thickness`.
         - Every light has one row in `colors` and one in `directions` or `positions`. No direction is zero.
         - Every internal light is on the camera's side of the opaque skin. This means z <= 0 in every row of
           `directions` (`Lights`) or `positions` (`Leds`).

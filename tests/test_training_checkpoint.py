@@ -199,6 +199,15 @@ def test_a_kill_inside_a_save_loses_nothing(tmp_path, finished, monkeypatch, mom
     assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["00000004"]
 
 
+def test_a_folder_of_the_user_beside_the_checkpoints_is_kept(tmp_path):
+    own = tmp_path / "run" / "checkpoints" / "best"
+    own.mkdir(parents=True)
+    (own / "note.txt").write_text("keep")
+    train(tmp_path / "run")
+    assert (own / "note.txt").read_text() == "keep"
+    assert sorted(path.name for path in own.parent.iterdir()) == ["00000004", "best"]
+
+
 @pytest.mark.filterwarnings("ignore:.*never awaited:RuntimeWarning")  # Orbax leaves coroutines behind
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_full_disk_is_one_clear_error_and_keeps_the_checkpoint(folder, state):

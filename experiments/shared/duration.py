@@ -72,7 +72,7 @@ def plan(config: Config, *, num: int = 64, steps: int = 4) -> str:
 
 
 def shown(lines: Sequence[Line]) -> str:
-    """Format the durations of the parts of an experiment as text, with one line for each part."""
+    """Format the expected durations of the parts of an experiment as text, with one line for each part."""
     return "\n".join(f"{line.part:<36}{line.seconds:>9.0f} s   ({line.note})" for line in lines)
 
 

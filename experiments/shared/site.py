@@ -28,7 +28,7 @@ Image = UInt8[np.ndarray, "height width 3"]
 class Site(abc.ABC):
     """A web server with one page.
 
-    The server listens on one address only. It refuses requests for another host name, and actions without the HTTP
+    The server listens on the given address. It refuses requests for another host name, and actions without the HTTP
     header that the page sends. Therefore, another site in the same browser cannot see the images or press the buttons.
     """
 

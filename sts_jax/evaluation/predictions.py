@@ -20,9 +20,10 @@ _CHUNK = 64  # number of trajectories that one call predicts
 class Predicted(NamedTuple):
     """The predicted last frames of n trajectories. Quantities that are not predicted are None.
 
-    A prediction is a single frame, or a distribution that is given by k samples. In the second case, `visual` and
-    `tactile` are the means of the samples. The position in `pose` is the geometric median of the samples, and the
-    orientation in `pose` is that of a sample near the centre of the distribution.
+    A prediction is a single frame, or a distribution that is given by k samples. In the second case, `visual`,
+    `tactile` and `pose` are in the centre of the distribution. For re-rolls and state-space models, the images are
+    means of the distribution, the position in `pose` is a geometric median, and the orientation is that of a sample
+    near the centre.
     """
 
     visual: np.ndarray | None = None  # visual images, (n, height, width, 3), float in [0, 1] or uint8

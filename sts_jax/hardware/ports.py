@@ -74,7 +74,7 @@ def find_controllers() -> list[Port]:
 
 
 def open_port(name: str, baud: int = protocol.BAUD) -> serial.Serial:
-    """Open a serial port so that no other process can open it.
+    """Open a serial port, and lock it against other programs that use this library or pyserial's exclusive mode.
 
     Args:
         name: Name of the port, such as `/dev/ttyACM0`, or a URL of pyserial, such as `socket://localhost:7000`.
@@ -86,7 +86,7 @@ def open_port(name: str, baud: int = protocol.BAUD) -> serial.Serial:
     Raises:
         PortNotFoundError: There is no such port.
         PortPermissionError: The user is not allowed to open the port.
-        PortInUseError: Another process, or another part of this process, has opened the port.
+        PortInUseError: Another process, or another part of this process, has locked the port.
         NotALedControllerError: The device is not a serial port.
         LedError: The port cannot be opened for another reason.
     """

@@ -130,7 +130,7 @@ class Replay:
             ValueError: `warmup_s` is negative or not finite, or the recording is empty or has another version of the
                 format. A replay of two video files also raises this error if the lengths of the videos differ by more
                 than one frame, if the constructor argument `fps` is not positive and finite, or if a path names a
-                camera device or a network stream instead of a file.
+                camera device instead of a file.
         """
         if not 0 <= warmup_s < math.inf:
             raise ValueError(f"warmup_s must be >= 0 and finite, got {warmup_s}")
@@ -185,7 +185,7 @@ class Replay:
         return self._waited(self._pair_from(self._position), limit_s)
 
     def async_read(self, timeout_ms: float | None = None) -> Pair:
-        """Return the newest available pair that was not returned yet, or wait for the next one.
+        """Return the newest available pair that this method has not returned yet, or wait for the next one.
 
         A pair consists of a visual and a tactile image. With `speed=None`, return the pair that follows the last
         returned pair, without waiting.

@@ -419,7 +419,8 @@ class STS:
 
         Raises:
             NoContrastError: The lights do not change the image.
-            LightError: In each of three attempts, the image had not settled within `watch_s` seconds after a switch.
+            LightError: In each of three attempts, the image was still changing at the end of the time `watch_s` after a
+                switch.
             LedError: The controller does not answer.
             CameraError: The sensor is not connected, or the camera sends no usable frames.
         """

@@ -110,9 +110,9 @@ class Released(Scenario):
         the balancing object has the lowest centre of mass. If no drawn edge is suitable, for example for a cylinder on
         its side, the method takes the edge with the lowest centre of mass.
 
-        If the edge is suitable, the object is tilted from the narrower of the two faces that meet at the edge. In most
-        cases, the released object turns by less than 45 degrees if it returns to the narrower face, and by more than 45
-        degrees if it topples onto the wider face. The method `outcome` uses this difference.
+        At an edge between two perpendicular faces, the released object turns by less than 45 degrees if it returns to
+        its face, and by more than 45 degrees if it topples onto the other face. The method `outcome` uses this
+        difference.
         """
         candidates, beyond, skew, radius, angle, share = jax.random.split(key, 6)
         keys = jax.random.split(candidates, self.tries)

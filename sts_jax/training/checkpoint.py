@@ -139,7 +139,7 @@ def verified(folder: Path) -> Path | None:
 
 
 def read(path: Path, like: State) -> State:
-    """Read a checkpoint. Arrays that are not in `like` are not read.
+    """Read a checkpoint. Parts of the state, such as the optimiser's, that `like` lacks are not returned.
 
     Args:
         path: Folder of the checkpoint.
@@ -252,10 +252,11 @@ def _steps(folder: Path) -> list[int]:
 
 
 def _keep_only(folder: Path, step: int | None) -> None:
-    """Delete all checkpoints in a model's folder but that of one step. None deletes all."""
+    """Delete all checkpoints in a model's folder but that of one step. None deletes all. Other folders are kept."""
     checkpoints = folder / "checkpoints"
     for path in checkpoints.iterdir() if checkpoints.is_dir() else ():
-        if step is None or path != manifest.checkpoint(folder, step):
+        made = path.name.split(".")[0].isdecimal()  # Orbax adds a suffix to the name of an unfinished checkpoint
+        if made and (step is None or path != manifest.checkpoint(folder, step)):
             shutil.rmtree(path, ignore_errors=True)  # a folder that remains is ignored: the manifest does not name it
 
 

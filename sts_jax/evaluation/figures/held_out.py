@@ -143,7 +143,7 @@ def ends(
     *,
     title: str,
 ) -> None:
-    """Draw the possible last positions of one trajectory beside the predicted ones, with the pad seen from above.
+    """Draw the possible last positions of one trajectory beside the predicted ones, on the pad as the camera sees it.
 
     The y axis points down, as in the images.
 
