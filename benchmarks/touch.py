@@ -76,7 +76,9 @@ def ridge(x: np.ndarray, y: np.ndarray, x_new: np.ndarray, penalty: float = 1.0)
 
 
 def saturated(tactile: np.ndarray, blank: np.ndarray) -> np.ndarray:
-    """Find out which pixels of imprints are saturated. An imprint is the part of an image that differs from `blank`.
+    """Find out which pixels of imprints are saturated.
+
+    An imprint consists of the pixels of which a channel differs from `blank` by more than 3 (of 255).
 
     Args:
         tactile: Tactile images, uint8 `(n, h, w, 3)`.

@@ -283,7 +283,7 @@ def test_missing_boards_are_named(images):
         calibrate([*images[:3], empty, few, empty, empty], BOARD)
     with pytest.raises(CalibrationError, match="image 0 must show at least 12 corners of the board, but it shows 0"):
         calibrate([empty, *images], BOARD)
-    with pytest.raises(CalibrationError, match="needs at least 6 images of the board in different poses, got 2"):
+    with pytest.raises(CalibrationError, match="needs at least 6 images of the board in different poses, but only 2"):
         calibrate(images[:2], BOARD)
 
 

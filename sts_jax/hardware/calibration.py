@@ -119,8 +119,8 @@ def fit_lens(
         )
     if len(found) < FEWEST_IMAGES:
         raise CalibrationError(
-            f"a calibration needs at least {FEWEST_IMAGES} images of the board in different poses, got {len(found)}. "
-            "Take more images."
+            f"a calibration needs at least {FEWEST_IMAGES} images of the board in different poses, but only "
+            f"{len(found)} images are given. Take more images."
         )
     counts = tuple(len(corners.numbers) for corners in found)
     used = _usable(counts, on_pad)

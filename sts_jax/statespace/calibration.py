@@ -53,8 +53,8 @@ def of_items(config: Config, calibration: Calibration, present: dict[str, Bool[A
         config: Configuration of the model.
         calibration: Values for each subset of the inputs.
         present: Masks `(n,)` of the inputs by name. True means that the item has the input. An item with the input
-            `state` (the true pose, shape and mass) gets the values 1, which leave the predicted density of its final
-            pose unchanged.
+            `state` (the true pose, shape and mass) gets the value 1 for each number that corrects the density of the
+            final pose, so the density stays unchanged.
 
     Returns:
         A `Calibration` whose four arrays, such as `outcome` and `contrast`, have one value for each item, `(n,)`.
