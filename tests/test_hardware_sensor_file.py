@@ -139,7 +139,7 @@ def test_a_truncated_file_is_refused(tmp_path, size):
     saved(tmp_path)
     path = tmp_path / "sensor.json"
     path.write_bytes(path.read_bytes()[:size].rstrip(b"\n}"))
-    with pytest.raises(OSError, match=r"sensor\.json cannot be read as JSON .*experiments\.commission` again"):
+    with pytest.raises(SensorFileError, match=r"sensor\.json cannot be read as JSON .*experiments\.commission` again"):
         Device.load(path)
     with pytest.raises(FileNotFoundError):
         Device.load(tmp_path / "missing.json")

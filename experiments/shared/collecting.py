@@ -101,9 +101,10 @@ def collect(config: Collect) -> None:
     The collection ends when there are enough trajectories or the user stops the command.
 
     Raises:
-        ValueError: An option is missing or out of range, or contradicts a file in the work directory.
+        ValueError: An option is missing or out of range, or contradicts a file in the work directory. Or a sensor file
+            is damaged.
         LockedError: Another process collects into the work directory.
-        OSError: A file cannot be read or written, or is damaged.
+        OSError: A file cannot be read or written, or another file is damaged.
         LedError, CameraError, LightError, NoContrastError: The sensor cannot be connected or read.
     """
     if config.twin:

@@ -157,8 +157,7 @@ def sensor_file(workdir: Path) -> tuple[hardware.Device, sts.Sensor]:
 
     Raises:
         FileNotFoundError: There is no sensor file.
-        DamagedFileError: The sensor file cannot be read, or is not JSON.
-        ValueError: The content of the sensor file is invalid, or it names no background images.
+        ValueError: The sensor file is damaged, or names no background images.
     """
     path = workdir / "sensor.json"
     if not path.exists():

@@ -27,7 +27,7 @@ class ImageError(NamedTuple):
     """Errors of n predicted images. Each error is a sum over all pixels of an image, or over the pixels of a mask.
 
     The field `excess` is the cross-entropy of each predicted image minus the entropy of the true image. A perfect
-    prediction has an excess of 0.
+    prediction has an excess of almost 0, because values are clipped to half a grey level from 0 and 1.
     """
 
     bce: np.ndarray  # (n,): binary cross-entropy, summed over pixels and channels (nats)

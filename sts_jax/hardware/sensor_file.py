@@ -225,12 +225,15 @@ class Device:
 
         Raises:
             FileNotFoundError: There is no such file.
-            OSError: The file cannot be read or is not JSON.
-            SensorFileError: The file describes no device, or was written in another version of the format. Or a field
-                is missing, unknown or out of range. Or a background image is missing or damaged.
+            SensorFileError: The file cannot be read, is not JSON, describes no device, or was written in another
+                version of the format. Or a field is missing, unknown or out of range. Or a background image is missing
+                or damaged.
         """
         file = sensor_file(path)
-        values = storage.read_json(file, f"{_COMMISSION} again")
+        try:
+            values = storage.read_json(file, f"{_COMMISSION} again")
+        except storage.DamagedFileError as error:
+            raise SensorFileError(str(error)) from error
         device = values.get("device") if isinstance(values, dict) else None
         if not isinstance(device, dict):
             raise SensorFileError(
