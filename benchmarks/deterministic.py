@@ -9,7 +9,7 @@ acceleration of the pad. The loss contains the cross-entropies of the last visua
 of the outcome (how the trajectory ends, such as `FELL_OFF`), and the squared error of the final pose. Only trajectories
 with images are used. For a comparison at equal cost, set `--seconds` to the training time of the run's state-space
 model. Prints the errors of the network and of the baselines, which are simple predictions without a model. Missing
-parts of the run's dataset are collected, and no other files are written.
+parts of the run's dataset are collected, and the results are not written to files.
 """
 
 import dataclasses

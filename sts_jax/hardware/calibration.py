@@ -28,7 +28,7 @@ _PRIOR = np.array([0.5, 1.0, 2.0, 5.0])
 
 
 class CalibrationError(ValueError):
-    """Raised if a lens cannot be calibrated from the given images. The message names the images and the remedy."""
+    """Raised if a lens cannot be calibrated, or does not show the whole pad. The message states the remedy."""
 
 
 @dataclasses.dataclass(frozen=True)

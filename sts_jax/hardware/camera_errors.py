@@ -1,4 +1,4 @@
-"""Errors of the camera. Each message names the camera, the cause and the remedy."""
+"""Errors of the camera. Each message states the cause and the remedy."""
 
 
 class CameraError(RuntimeError):

@@ -53,7 +53,7 @@ class Leds:
     """Lights inside the sensor, modelled as points at a finite distance. There may be any number m of lights.
 
     By default, a red, a green, a blue and a white LED shine at a grazing angle into the four edges of the pad. They are
-    as bright as possible without clipped pixels in the image of the untouched pad.
+    about as bright as possible without clipped pixels in the image of the untouched pad.
     """
 
     # Positions in the sensor frame (m). Defaults: 30 mm beyond the pad's left, right, top and bottom edge, 3 mm below
