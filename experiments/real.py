@@ -13,13 +13,13 @@
     python -m experiments.real review --discard 3 17
 
 The default sub-command is `train`. This sub-command trains three models on the trajectories in `WORKDIR/dataset`. The
-models are called "VAE visual", "VAE tactile" and "MVAE without pose". The models learn to predict the images of the
-object at rest from the images of the held object. Results go to `WORKDIR/table2`. With `--preset paper`, the
-sub-command first prints the expected seconds of each stage, unless there are results already. A work
-directory cannot contain trajectories of both a device and the twin, so give the twin a separate `--workdir`.
+models are called "VAE visual only", "VAE tactile only" and "MVAE without pose". The models learn to predict the images
+of the object at rest from the images of the held object. Results go to `WORKDIR/table2`. With `--preset paper`, the
+sub-command first prints the expected seconds of each stage, unless there are results already. A work directory cannot
+contain trajectories of both a device and the twin, so give the twin a separate `--workdir`.
 
-`--sensor` is the sensor file of `experiments.commission`. The sensor file contains the calibration of the lens, and
-images of the empty pad. Training needs both.
+`--sensor` is the sensor file of `experiments.commission`. The sensor file contains the lens, and names the images of
+the empty pad, which are in the same folder. Training needs the lens and these images.
 
 `collect` guides a person through trajectories: place the object in an unstable pose, hold the object, release the
 object, and wait until the object rests. A trajectory has two pairs of a visual and a tactile image. The first pair

@@ -53,7 +53,8 @@ class Lights:
         for (begin_s, share), (stop_s, _) in zip(changes, [*changes[1:], (end_s + 1, 0.0)], strict=True):
             overlap_s = min(stop_s, end_s) - max(begin_s, start_s)
             if overlap_s > 0:
-                found.append(share)
+                if found[-1:] != [share]:
+                    found.append(share)
                 mean += share * overlap_s / (end_s - start_s)
         return found, mean
 

@@ -26,7 +26,7 @@ _STEPS = 4  # number of gradient steps in a measurement
 class Train:
     """Train the models of the paper's Table 2 on recorded trajectories, and write the table.
 
-    The models are VAE visual, VAE tactile and MVAE without pose.
+    The models are VAE visual only, VAE tactile only and MVAE without pose.
     """
 
     # configuration of the preset. Each of its fields is an option

@@ -11,8 +11,8 @@ The guide compares the mean colours of blocks of pixels, because the noise of si
 - A contact is a difference between the mean colours of a block in the current tactile image and in a tactile image of
   the empty pad. For this purpose, the images are divided into 48 rows of 64 blocks, because a contact can be small.
 
-Changes and differences count only if they exceed a threshold. The threshold is a multiple of the noise that the mean
-colour has on the empty pad.
+Changes and differences count only if they exceed a threshold. The threshold is a multiple of the noise of the mean
+colour, but at least 3 and at most 24 of 255.
 """
 
 import dataclasses
