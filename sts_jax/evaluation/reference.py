@@ -26,9 +26,9 @@ def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str
     - The copy predicts that the last frame equals the first one.
     - The nearest neighbour is the last frame of the most similar training trajectory. Two trajectories are compared by
       the squared distance between their first visual images. In scenarios with a condition (known quantities, such as
-      the acceleration of the pad), the squared distance is first divided by the variance of the images. The mean
-      squared difference of the quantities is then added, where the squared difference of each quantity is divided by
-      its variance. The variances are those of the training set.
+      the acceleration of the pad), the squared distance is first divided by the mean squared distance of the images
+      from their mean. The mean squared difference of the quantities is then added, where the squared difference of each
+      quantity is divided by its variance. The variances are those of the training set.
     - The rule "rests below its start" keeps x, y and the orientation of the first pose. The predicted height is the
       median of the heights of the training objects in their last frames, without the objects that leave the pad. The
       rule predicts no images.

@@ -49,7 +49,7 @@ class Background:
             return self._pair
 
     def next(self, limit_s: float) -> Pair:
-        """Wait until there is a pair that this method has not returned yet, and return the newest pair.
+        """Wait until there is a pair of images that this method has not returned yet, and return the newest pair.
 
         If an error has ended the thread that takes the pairs, this method raises the same error.
 

@@ -281,7 +281,8 @@ class Replay:
         """Wait until nothing moves in the visual stream. `STS.wait_until_still` describes the criterion.
 
         Args:
-            timeout_s: Time after the first image at which the method gives up, in seconds of the recording.
+            timeout_s: Time after the first image of this call at which the method gives up, in seconds of the
+                recording.
             window_s: Time during which nothing may move, in seconds of the recording.
 
         Returns:

@@ -35,12 +35,11 @@ CLEARANCE = 0.001  # m, smallest distance of a start on the slope from the stop 
 class Inclined(Scenario):
     """An object starts at rest on the tilted pad, or is released just above it. Downhill is +y.
 
-    A stop wall stands at the lower edge of the pad. The contents of each object have settled
-    before the start, while the object had another orientation. That orientation is random, and the field `tilt` limits
-    how far it is from upright. On the
-    slope, the contents do not move inside the object, so the contents have the same place in the object in all frames.
-    For a start at rest, the centre of pressure in frame 0 reveals this place. The weight alone reveals little about
-    this place.
+    A stop wall stands at the lower edge of the pad. The contents of each object have settled earlier, in another,
+    random orientation of the object. The field `tilt` limits how far that orientation is from upright. On the slope,
+    the contents do not move inside the object, so the contents have the same place in the object in all frames. For a
+    start at rest, the centre of pressure in frame 0 reveals this place. The weight alone reveals little about this
+    place.
 
     In most poses, the contents hardly matter: a flat object stays and a high object tips, wherever its contents lie.
     For a start at rest, several random poses are therefore compared (the field `tries` is their number). The object

@@ -22,7 +22,7 @@ class Arrays:
     sample. Images are uint8, or float32 in [0, 1].
 
     Raises:
-        ValueError: The arrays whose first axis is the sample have different lengths, or the length 0.
+        ValueError: The arrays have different numbers of samples, or no samples.
     """
 
     inputs: dict[str, np.ndarray]  # inputs of the model, from first frames
