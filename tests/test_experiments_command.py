@@ -363,7 +363,7 @@ def test_a_warning_is_one_line_and_later_warnings_are_as_before():
 
 
 def test_a_second_run_in_a_work_directory_is_refused(tmp_path):
-    with storage.lock(tmp_path), pytest.raises(storage.LockedError, match="wait until that process has finished"):
+    with storage.lock(tmp_path), pytest.raises(storage.LockedError, match="close what uses the folder in this process"):
         stages.main(freefall.SMOKE, tmp_path)
     assert not (tmp_path / "config.json").exists()
 

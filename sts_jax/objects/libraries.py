@@ -91,7 +91,7 @@ def library(
         )
     for name, value in (("longest_side", longest_side), ("largest", largest)):
         if value is not None and not SMALLEST <= value <= PAD:
-            raise ValueError(f"{folder}: {name} is {value} m, but it must be from {SMALLEST} to {PAD} m")
+            raise ValueError(f"{folder}: the argument {name} is {value} m, but it must be from {SMALLEST} to {PAD} m")
     if up is not None and up not in AXES:
         raise ValueError(f"{folder}: up must be 'x', 'y' or 'z', got {up!r}")
     if isinstance(faces, bool) or not isinstance(faces, int | np.integer) or faces < 4:

@@ -169,8 +169,8 @@ def read(path: Path, like: State) -> State:
                     "optimiser."
                 ) from None
             raise ValueError(
-                f"{path} cannot be read {reason}, although its checksums are right. It belongs to another model or to a "
-                "version of sts_jax with other networks, or it was damaged before the checksums were computed. Give "
+                f"{path} cannot be read {reason}, although its checksums are right. It belongs to another model or to "
+                "a version of sts_jax with other networks, or it was damaged before the checksums were computed. Give "
                 "another folder, load the model with the version that trained it, or delete the folder and train again."
             ) from None
     return jax.tree.unflatten(jax.tree.structure(like), [loaded[name] for name in _plain(like)])
