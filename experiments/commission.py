@@ -32,7 +32,8 @@ def find(config: Config) -> str:
     """Find the devices that the options do not name.
 
     Returns:
-        A text that lists the cameras and serial ports, and ends with the command to run next.
+        A text that lists the cameras and USB serial ports among which the user must choose, and the command to run
+        next.
 
     Raises:
         ValueError: `camera` is None and no camera was found, or `leds` is None and no USB serial port was found.

@@ -16,7 +16,8 @@ def call(function: str, *arguments: Any, cache: Path | None = None) -> Any:
     Args:
         function: Module and name of the function, such as `benchmarks.sensor.cost_of`.
         arguments: Positional arguments of the function. Arguments and result must be serialisable as JSON.
-        cache: Folder of JAX's persistent compilation cache in the new process. Default: the setting of this process.
+        cache: Folder of JAX's persistent compilation cache in the new process. Default: the environment variable
+            JAX_COMPILATION_CACHE_DIR of this process.
 
     Returns:
         The result of the function.

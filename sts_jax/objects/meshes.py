@@ -194,7 +194,7 @@ def _check_arguments(
     try:
         check_category(category)
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+        raise ValueError(f"{path}: the argument {error}") from None
     if longest_side is not None and scale is not None:
         raise ValueError(f"{path}: give longest_side or scale, not both")
     if faces is not None and (isinstance(faces, bool) or not isinstance(faces, int | np.integer) or faces < 4):

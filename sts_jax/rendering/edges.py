@@ -31,9 +31,9 @@ def with_moving_edges(
     change of the point's depth below the undeformed surface of the gel (m). The second term is a sum over pairs of
     neighbouring pixels. For each pair, the difference of the imprint's depths at the two pixels is multiplied by the
     component of v along the line from one pixel to the other. This component is taken at the pixel at which the object
-    is nearer to the camera. Half of this product is added to the derivative at each of the two pixels. The pairs are
-    the micro-edges of Pidhorskyi et al. 2024, "Rasterized Edge Gradients". The derivative is accurate on average over a
-    few pixels.
+    is nearer to the camera. Half of this product is subtracted from the derivative at each of the two pixels. The pairs
+    are the micro-edges of Pidhorskyi et al. 2024, "Rasterized Edge Gradients". The derivative is accurate on average
+    over a few pixels.
 
     Args:
         imprint: Depth of the imprint below the undeformed surface of the gel (m).
