@@ -135,7 +135,7 @@ class Args:
 
 
 def outcomes(study: Study, starts: Starts) -> None:
-    """Print the shares of outcomes, of unsettled starts, and of starts whose outcome changes with other contents.
+    """Print the share of each outcome, of unsettled starts, and of starts whose outcome depends on the hidden contents.
 
     A start is the initial state of a trajectory. The outcome is how the trajectory ends, such as by toppling. A start
     is unsettled if its object lies on the pad at the end of the trajectory but has not come to rest. For the last

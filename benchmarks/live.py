@@ -2,13 +2,13 @@
 
     python -m benchmarks.live
 
-In the digital twin, a hand holds an object in an unstable pose and lets go. Each model predicts the images at rest from
-the images of the held object, as `experiments.live` does. The command prints the skill of the predicted images: one
-number for all trajectories together, computed from mean squared errors. The skill is 1 if each prediction is the true
-image at rest. It is 0 if the prediction for each trajectory is the mean of the images at rest from all other
-trajectories. No model was trained with the twin's noise, vignetting and leaking light. The twin's object moves as in
-the scenario `physics.Released`. Only the model `released` was trained on this scenario, with objects of the same class
-as the twin's object.
+In the digital twin, a hand holds an object in an unstable pose and lets go. Each model predicts the images of the
+object at rest from the images of the held object, as `experiments.live` does. The command prints the skill of the
+predicted images: one number for all trajectories together, computed from mean squared errors. The skill is 1 if each
+predicted image equals the true last image. It is 0 if the prediction for each trajectory is the mean of the last images
+of all other trajectories. No model was trained with the twin's noise, vignetting and leaking light. The twin's object
+moves as in the scenario `physics.Released`. Only the model `released` was trained on this scenario, with objects of the
+same class as the twin's object.
 """
 
 import dataclasses
@@ -111,8 +111,8 @@ def skill(found: np.ndarray, truth: np.ndarray) -> float:
 def main(args: Args) -> None:
     """Record trajectories of the digital twin, and print a table with the skill of every model.
 
-    The skill is a score of the predicted images. It is 1 if each prediction is the true image at rest. It is 0 if the
-    prediction for each trajectory is the mean of the images at rest from all other trajectories.
+    The skill is a score of the predicted images. It is 1 if each predicted image equals the true last image. It is 0 if
+    the prediction for each trajectory is the mean of the last images of all other trajectories.
 
     In the rows with `kept`, the images contain the background of the twin, such as its vignetting. In the rows with
     `divided out`, this background is replaced by the background of the model's training images (`hardware.relit`).

@@ -27,7 +27,8 @@ class ImageError(NamedTuple):
     """Errors of n predicted images. Each error is a sum over all pixels of an image, or over the pixels of a mask.
 
     The field `excess` is the cross-entropy of each predicted image minus the entropy of the true image. A perfect
-    prediction has an excess of almost 0, because values are clipped to half a grey level from 0 and 1.
+    prediction has an excess of almost 0. It is not exactly 0, because predicted values below 1/510 or above 509/510 are
+    set to these limits.
     """
 
     bce: np.ndarray  # (n,): binary cross-entropy, summed over pixels and channels (nats)

@@ -22,7 +22,7 @@ class CameraOpenError(CameraError):
 
 
 class CameraNotConnectedError(CameraError):
-    """The camera is not connected, or it was disconnected during the call."""
+    """The method `connect` was not called, or `disconnect` was called during the call of another method."""
 
 
 class CameraTimeoutError(CameraError, TimeoutError):

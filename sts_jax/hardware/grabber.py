@@ -199,7 +199,8 @@ class Grabber:
                         return frame
                 if self._stop.is_set():
                     raise CameraNotConnectedError(
-                        f"{self._config.name} was disconnected during the call: call connect() to open it again."
+                        f"disconnect() of {self._config.name} was called during this call: call connect() to open the "
+                        "camera again."
                     )
                 remaining = deadline - time.monotonic()
                 if self._problem is not None and not (lost_before and self._is_lost() and remaining > 0):

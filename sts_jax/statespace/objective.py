@@ -19,8 +19,8 @@ negative log likelihood. The loss is the weighted sum of these terms:
 - `look`: the divergence of the appearance code from its prior, multiplied by `beta` in the loss
 
 The decoder renders the object in its true pose in each of the two frames. It therefore never learns a mean of images
-for several possible poses. For each item of the batch, a random subset of its inputs is chosen that contains an image.
-The decoder receives an appearance code that is drawn from the belief from this subset.
+for several possible poses. For each item of the batch, a random subset of its inputs is chosen. It contains at least
+one image. The decoder receives an appearance code that is drawn from the belief from this subset.
 
 Two further kinds of data contribute to some of the terms. *Views* are first frames without a trajectory. Views
 contribute to `state` and `doubt`. In `first` and `covered`, views replace the first frames of the trajectories. *Falls*

@@ -1,6 +1,7 @@
 """Fit the calibration of a trained state-space model, on trajectories of objects that it was not trained on.
 
-The calibration consists of numbers that correct the model's predictions, such as the probabilities of outcomes.
+The calibration corrects the predicted probabilities of the outcomes and the predicted density of the final pose, and
+sets the contrast of sampled images.
 """
 
 import os

@@ -15,8 +15,8 @@ class Hand(AutomaticPerson):
 
     `hardware.collect` shows its instructions as a `View`. The hand sends the matching commands to the twin, and
     confirms every trajectory. If an object does not move after its release, the hand confirms the release, as a person
-    would. If `hardware.collect` detects no contact of a held object within 3 s, the hand holds the object in the first
-    pose of the next trajectory. The trajectory without contact is not recorded, and its number stays unused in the
+    would. If `hardware.collect` detects no contact between a held object and the pad within 3 s, the hand gives up this
+    trajectory, and continues with the first pose of the next one. The number of the trajectory stays unused in the
     session.
 
     The session numbers the trajectories, and the scene of the twin numbers them independently. A trajectory has the
