@@ -3,8 +3,8 @@
 The modules are used functionally. `init` splits a model once into its definition, parameters and batch statistics, and
 `flax.nnx.merge(graphdef, params, stats, copy=True)` assembles it again inside `jax.jit`.
 
-Images have shape `(batch, height, width, channel)`. An encoder takes values in [0, 1], and a decoder returns logits.
-Vectors have shape `(batch, size)`.
+Images have shape `(batch, height, width, channel)`. Their encoders take values in [0, 1], and their decoders return
+logits. Vectors have shape `(batch, size)`, and their encoders and decoders have values of any size.
 
 Source: the paper's supplement, "Network Architecture". The hidden widths are those of Wu and Goodman (2018).
 """

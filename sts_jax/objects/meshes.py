@@ -185,11 +185,13 @@ def _check_arguments(
             raise ValueError(f"{path}: the argument `{name}` must be a positive number of {unit}, got {value!r}")
     for name, value in (("longest_side", longest_side), ("largest", largest)):
         if value is not None and value > PAD:
-            raise ValueError(f"{path}: {name} is {value} m, but the sensor's pad is {PAD} m wide: give at most {PAD}")
+            raise ValueError(
+                f"{path}: the argument {name} is {value} m, but the sensor's pad is {PAD} m wide: give at most {PAD}"
+            )
         if value is not None and value < SMALLEST:
             raise ValueError(
-                f"{path}: {name} is {value} m, but an object must be at least {SMALLEST} m long: give at least "
-                f"{SMALLEST}"
+                f"{path}: the argument {name} is {value} m, but an object must be at least {SMALLEST} m long: give at "
+                f"least {SMALLEST}"
             )
     try:
         check_category(category)
