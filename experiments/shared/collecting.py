@@ -177,14 +177,14 @@ def keep(file: Path, workdir: Path) -> None:
 
     Raises:
         ValueError: The work directory already contains a sensor file with another content.
-        SensorFileError: The content of a sensor file is invalid.
-        OSError: A file cannot be read or written, or is damaged.
+        SensorFileError: A sensor file or a background image is damaged.
+        OSError: The sensor file does not exist, or a file cannot be written.
     """
     file, copy = hardware.sensor_file.sensor_file(file), workdir / hardware.sensor_file.NAME
     device = hardware.Device.load(file)
     if copy.exists():
-        constants, kept = (sts.Sensor.load(path).constants() for path in (file, copy))
-        if hardware.Device.load(copy) != device or kept != constants:
+        kept = hardware.Device.load(copy)
+        if kept != device or sts.Sensor.load(copy).constants() != sts.Sensor.load(file).constants():
             raise ValueError(
                 f"{copy} differs from {file}, but one sensor file must describe all trajectories of a work directory: "
                 "choose another --workdir"

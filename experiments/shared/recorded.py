@@ -186,7 +186,7 @@ def jobs(config: Config, data: Recorded) -> Iterator[stages.Job]:
     """Prepare the training of each of the three models of the paper's Table 2.
 
     Raises:
-        ValueError: No tactile image for training shows a contact.
+        ValueError: No tactile image that is an input of the training shows a contact.
     """
     size, blank = (config.image_size, config.image_size), data.empty["tactile"]
     preprocessing = training.touch_of_noisy_images(training.Preprocessing(size), data.train.tactile[:, 0], blank)
@@ -235,7 +235,7 @@ def train(config: Config, data: Recorded, folder: Path) -> None:
     Each model is stored in its own folder, such as `folder / "models" / "vae-visual"`.
 
     Raises:
-        ValueError: No tactile image for training shows a contact.
+        ValueError: No tactile image that is an input of the training shows a contact.
     """
     for job in jobs(config, data):
         with Bar() as bar:

@@ -271,7 +271,7 @@ class STS:
     def disconnect(self) -> None:
         """Turn the lights off, and close the camera and the LED controller.
 
-        The method does nothing if the sensor is not connected.
+        Repeated calls have no effect.
         """
         self._stop_background()
         leds, self._leds = self._leds, None
