@@ -456,7 +456,7 @@ def measure_part(order: list[str], seed: int, long: float) -> dict[str, Count]:
 
 
 def report(counts: dict[str, Count]) -> str:
-    """Format the results as a table with a row for each kind of fault. A sentence describes the kind `KILLED`."""
+    """Format the results as text: a table of the faults of camera and controller, and a sentence on killed programs."""
     lines = [
         "fault                 injected  images  wrong  old  longest read (s)  limit (s)  recovered  after (s)  "
         "reads with errors"

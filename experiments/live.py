@@ -2,7 +2,7 @@
 
     python -m experiments.live                                            # starts a digital twin and serves a web page
     python -m experiments.live --sensor bench                             # the sensor of a sensor file
-    python -m experiments.live --camera URL --leds PORT --sensor bench    # other paths to the devices of the file
+    python -m experiments.live --camera URL --leds PORT --sensor bench    # the same sensor under other addresses
     python -m experiments.live --sensor bench --record runs/monday        # also records both streams
     python -m experiments.live --replay runs/monday --loop                # predicts from a recording
     python -m experiments.live --replay visual.mp4 tactile.mp4 --sensor bench

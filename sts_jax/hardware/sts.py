@@ -210,7 +210,7 @@ class STS:
 
     @property
     def settling(self) -> Settling:
-        """The settling times: for how long frames are discarded after the lights are switched off or on.
+        """The settling times. After the lights are switched off or on, frames are discarded for the settling time.
 
         Raises:
             CameraNotConnectedError: No settling times were given, and `connect` has not measured them yet.

@@ -44,8 +44,8 @@ def draw(
     """Draw a `Start` and the hidden properties (friction, mass of the shell, contents) of each of n trajectories.
 
     The draw with index i depends on `key`, on `body[i]`, `nth[i]` and `attempt[i]`, and on the geometry of the body
-    `body[i]`. The draw does not depend on the other draws. In `Inclined`, it also depends on the number of faces to
-    which the arrays in `shapes` are padded.
+    `body[i]`. The draw does not depend on the other draws. In the scenario `Inclined`, a draw can change if the
+    arrays in `shapes` are padded to another number of faces.
 
     Args:
         key: Key of all draws.
@@ -76,7 +76,7 @@ def starts(
     A start contains an initial pose and hidden properties (friction, mass of the shell, and contents).
     `simulate` draws its starts from the same distribution. The starts of the two functions are independent, even if
     both functions receive the same key. Start j of body i depends on `key`, i, j and the body, not on the number of
-    other starts. In `Inclined`, it also depends on the largest number of stable faces of all bodies.
+    other starts. In the scenario `Inclined`, a start can change if a body with more stable faces is added to `bodies`.
 
     Args:
         key: Key of the whole set, from `jax.random.key`.
