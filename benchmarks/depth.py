@@ -88,8 +88,8 @@ def places(body: objects.Body, rng: np.random.Generator, kind: str) -> tuple[jax
     Args:
         body: The object.
         rng: Source of the random pose.
-        kind: "touching" if the object touches the pad, "above" if it is above the pad, or "out of view" if it is beside
-            the middle of the pad, where a part of it is usually out of view.
+        kind: "touching" if the object touches the pad, "above" if it is above the pad, or "out of view" if the
+            position is so far from the middle of the pad that a part of the object is usually out of view.
 
     Returns:
         The pose `(7,)` and the wrench `(6,)`. For the kind "touching", the wrench is due to a force of 1 N upwards at

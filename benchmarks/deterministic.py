@@ -8,8 +8,8 @@ first images, the first pose and the condition. The condition consists of known 
 acceleration of the pad. The loss contains the cross-entropies of the last visual image, of the last tactile image and
 of the outcome (how the trajectory ends, such as `FELL_OFF`), and the squared error of the final pose. Only trajectories
 with images are used. For a comparison at equal cost, set `--seconds` to the training time of the run's state-space
-model. Prints the errors of the network and of the baselines, which are simple predictions without a model. Missing
-parts of the run's dataset are collected, and the results are not written to files.
+model. Prints the errors of the network and of the baselines, which are simple predictions without a model. The
+printed errors are not written to a file. Missing parts of the run's dataset are collected.
 """
 
 import dataclasses

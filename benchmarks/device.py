@@ -87,7 +87,7 @@ class Measured(NamedTuple):
 
     @property
     def limit(self) -> float:
-        """Largest possible number of pairs per second, `1 / (2 / FPS + mean settling time of the lights)`."""
+        """Largest possible value of `rate`: `1 / (2 / FPS + mean settling time of the lights)`."""
         return 1 / (2 / FPS + (self.settling.visual_s + self.settling.tactile_s) / 2)
 
 

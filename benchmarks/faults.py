@@ -77,8 +77,8 @@ class Args:
             raise ValueError(f"--number must be at least 1, got {self.number}")
         if not 0 <= self.long <= 1:
             raise ValueError(
-                f"--long is the share of the long ones among faults of random duration, and must be in [0, 1], got "
-                f"{self.long}"
+                f"--long must be in [0, 1], got {self.long}. It is the share of faults of random duration that last "
+                "5 to 7 s"
             )
         if unknown := set(self.only) - set(KINDS) - {KILLED}:
             raise ValueError(
@@ -104,7 +104,7 @@ class Count:
     lit_s: float = 0.0  # longest time for which a light was on after the program was killed
 
     def add(self, other: "Count") -> None:
-        """Add the results in `other`, which are of further faults of the kind."""
+        """Add the results of another `Count` to this one."""
         for name in ("injected", "images", "wrong", "old", "unnamed", "recovered"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
         for name, number in other.errors.items():

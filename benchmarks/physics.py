@@ -180,7 +180,9 @@ def compare_speed(name: str, items: list[objects.Body], num: int) -> None:
 
 
 def engines(num: int, chunk: int) -> None:
-    """Measure how many falls of 16 objects per second each engine of `simulate` computes, and print the two rates.
+    """Measure the number of falls that each engine of `simulate` computes in a second, and print the two numbers.
+
+    A fall is the trajectory of one object. The falls of 16 different objects are simulated.
 
     Args:
         num: Number of falls of each object.

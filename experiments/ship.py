@@ -28,7 +28,7 @@ LIFT = 0.04  # height of every second bottle above the pad (m), because models o
 
 @dataclasses.dataclass(frozen=True)
 class Args:
-    """Options of the command line: the work directory, and the name that its model gets in the library."""
+    """Options of the command line."""
 
     workdir: Annotated[command.Folder, tyro.conf.Positional]  # work directory of an experiment
     name: str | None = None  # name of the model in the library. None: the name of the work directory

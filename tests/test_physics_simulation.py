@@ -362,7 +362,7 @@ def test_errors_name_fields_out_of_range(bodies: list[objects.Body], change: dic
     [
         ({"shell_mass": jnp.float32(-0.1)}, "body 1: shell_mass is -0.1"),
         ({"shell_mass": jnp.float32(jnp.nan)}, "body 1: shell_mass is nan"),
-        ({"hulls": jnp.full((1, 64, 3), jnp.nan)}, "body 1: hulls has a vertex that is not finite"),
+        ({"hulls": jnp.full((1, 64, 3), jnp.nan)}, "body 1: the field `hulls` has a vertex that is not finite"),
         ({"hulls": jnp.zeros((1, 64, 3))}, "body 1: the collision hull spans no volume"),
         ({"hulls": jnp.zeros((3, 64, 3))}, "body 1: hulls has shape"),
         ({"vertices": jnp.full((1024, 3), jnp.nan)}, r"body 1: vertices has values that are not finite \(3,072 of"),

@@ -59,7 +59,7 @@ class Lights:
         return found, mean
 
     def off_after(self, time_s: float) -> float | None:
-        """Return a time from which the lights have been off, not earlier than `time_s`.
+        """Return the time of the last change to lights that are off, but at least `time_s`.
 
         Return None if the lights are on now. All times are in seconds on `time.monotonic`.
         """

@@ -155,7 +155,7 @@ def draw(items: list[objects.Body], starts: Starts) -> tuple[np.ndarray, np.ndar
 
 
 def kept(folder: Path | None, name: str, make: Callable[[], Starts]) -> Starts:
-    """Load the initial states of trajectories from a file. If the file does not exist, make the states and write it.
+    """Load the initial states of trajectories from a file. If there is no file, make the states and write the file.
 
     Each initial state is stored together with the outcome of its trajectory.
 

@@ -140,8 +140,8 @@ def take(pictures: Pictures, sensor: hardware.STS, number: int, every: float | N
     Each picture that is kept is written to the folder at once.
 
     Args:
-        pictures: Pictures of an earlier run, which count towards `number`. If `000.png` is missing, the first new
-            picture becomes `000.png`.
+        pictures: Pictures of an earlier run, which count towards `number`. If the picture of the board on the pad,
+            `000.png`, is not among them, it is taken first.
         sensor: Connected sensor.
         number: Number of pictures in which the board must be found.
         every: Time to wait before each picture (s). None: wait for the Enter key.

@@ -152,7 +152,7 @@ def of_twin(config: Collect) -> simulated.Simulated:
         if value is not None:
             raise ValueError(f"--{name} is {value}, but no device is used with --twin: leave out --{name} or --twin")
     if not config.lock:
-        raise ValueError("--no-lock is given, but no device is used with --twin: leave out --no-lock or --twin")
+        raise ValueError("--no-lock has no effect on the digital twin (--twin): leave out --no-lock or --twin")
     default = simulated.Simulated(config.workdir)
     return simulated.Simulated(
         config.workdir,

@@ -29,9 +29,9 @@ def main(config: Config, workdir: Path, *, only: Stage | None = None, own: Exten
 
     Raises:
         ValueError: A field of the configuration is out of range, or the work directory has another configuration. The
-            error is also raised if a model in the work directory was trained with other `own.notes`, or if only one of
-            the two runs has a loss or an optimiser of its own, or if `own.measurements` is not empty although
-            `config.model` is not "paper".
+            error is also raised if `own.measurements` is not empty although `config.model` is not "paper", or if a
+            model in the work directory was trained with other `own.notes`, or with an own loss or optimiser where this
+            run has none (or the other way round).
         FileNotFoundError: A stage before `only` has not been run.
         LockedError: Another process works in the work directory.
     """

@@ -32,7 +32,7 @@ _COMMISSION = "run `python -m experiments.commission`"
 
 
 class SensorFileError(ValueError):
-    """Raised if the content of a sensor file is invalid, incomplete or of another version. The message names it."""
+    """Raised if a sensor file is damaged, incomplete or of another version. The message names the file and a remedy."""
 
 
 class WrongDeviceError(SensorFileError):

@@ -4,7 +4,7 @@ The modules are used functionally. `init` splits a model once into its definitio
 `flax.nnx.merge(graphdef, params, stats, copy=True)` assembles it again inside `jax.jit`.
 
 Images have shape `(batch, height, width, channel)`. Their encoders take values in [0, 1], and their decoders return
-logits. Vectors have shape `(batch, size)`, and their encoders and decoders have values of any size.
+logits. Vectors have shape `(batch, size)`. Their values are not limited.
 
 Source: the paper's supplement, "Network Architecture". The hidden widths are those of Wu and Goodman (2018).
 """

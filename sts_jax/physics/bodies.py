@@ -54,7 +54,7 @@ def check_bodies(bodies: Sequence[Any]) -> None:
                 "sequence",
             )
         if not np.isfinite(body.hulls).all():
-            raise BodyError(i, "hulls has a vertex that is not finite: repair the mesh")
+            raise BodyError(i, "the field `hulls` has a vertex that is not finite: repair the mesh")
         if not (np.isfinite(body.shell_mass) and body.shell_mass > 0):
             raise BodyError(
                 i,

@@ -1,8 +1,8 @@
 """A state-space model that predicts the last frame of a trajectory from the first frame.
 
-The inputs are some of the visual image, the tactile image and the object's pose in the first frame
-(`Config.inputs`), or any subset of these inputs. The model predicts the object's final pose, and the visual and tactile
-images of the last frame.
+The inputs of a model (`Config.inputs`) can be the visual image, the tactile image and the object's pose in the first
+frame. A trained model also predicts from any subset of its inputs. It predicts the object's final pose, and the visual
+and tactile images of the last frame.
 """
 
 from sts_jax.statespace.calibration import Calibration

@@ -117,10 +117,9 @@ def draw(
     num: int,
     drawn: int,
 ) -> Drawn:
-    """Sample final poses for each trajectory, and render the layers of some of them.
+    """Sample `num` final poses for each trajectory, and render layers for some of these poses.
 
-    The function samples `num` poses, and renders the layers of the first ones. The argument `drawn` is their number.
-
+    The argument `drawn` is the number of poses for which layers are rendered. They are the first poses.
     The layers are the outlines and colours of the objects, and the changes that the objects cause in the tactile
     images. `compose` combines them with the images of the empty sensor, and returns complete images. The arguments
     after `model` are the same as in `sample`.

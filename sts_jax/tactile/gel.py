@@ -95,8 +95,8 @@ def indent(gel: Gel, heights: Float[Array, "r c"]) -> Equilibrium:
         heights: Heights of the object's underside above the gel's face (m), `inf` where there is no object.
 
     Returns:
-        The `Equilibrium`, with `sink` and `turn` equal to 0. `balanced` is always True, because this function
-        does not look for a pose in which the pressure balances a load.
+        The `Equilibrium`, with `sink` and `turn` equal to 0. `balanced` is always True,
+        because there is no load that the pressure would have to balance.
     """
     pressure = gel.stiffness * jnp.clip(-heights, 0, gel.thickness)
     return Equilibrium(jnp.float32(0), jnp.zeros(2), pressure, jnp.bool_(True))

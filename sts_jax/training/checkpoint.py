@@ -139,7 +139,7 @@ def verified(folder: Path) -> Path | None:
 
 
 def read(path: Path, like: State) -> State:
-    """Read a checkpoint. Parts of the state, such as the optimiser's, that `like` lacks are not returned.
+    """Read a checkpoint. The result has only the parts that `like` has, for example no state of an optimiser.
 
     Args:
         path: Folder of the checkpoint.

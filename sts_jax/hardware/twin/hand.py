@@ -53,8 +53,9 @@ class Hand(AutomaticPerson):
             view: Newest images and instruction. `hardware.collect` calls this method with each new view.
 
         Raises:
-            ValueError: The stage of the collection stays the same without a problem for longer than the argument
-                `patience_s` of `Hand`, or no contact is detected while the object is held in ten poses in a row.
+            ValueError: The collection stays in the same stage for longer than the argument `patience_s` of `Hand`, or
+                no contact is detected in ten successive poses of the held object. The time does not count while `view`
+                contains a problem.
         """
         super().show(view)
         entered, self._seen = view.stage is not self._seen, view.stage
