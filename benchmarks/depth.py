@@ -185,7 +185,7 @@ def measure(
         first_seed: Offset of the seeds of the random poses.
 
     Returns:
-        A dictionary from the name of each object to the `total` of the differences in all images of the object.
+        A dictionary from the name of each object to the combined `Difference` of all its images.
     """
     sensor = sts.Sensor()
     sense = jax.jit(lambda *inputs: sts.sense(sensor, *inputs, resolution=shape))

@@ -385,7 +385,7 @@ def kill(bench: Bench, count: Count) -> None:
                 else f"but the program ended before, with exit status {status}: see its error output above"
             )
             raise RuntimeError(
-                "the benchmark must kill the program that reads the sensor, at a moment when a light is on, " + reason
+                "the program that reads the sensor was to be killed at a moment when a light is on, " + reason
             )
         process.send_signal(signal.SIGKILL)
         process.wait()

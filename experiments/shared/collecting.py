@@ -104,7 +104,7 @@ def collect(config: Collect) -> None:
         ValueError: An option is missing or out of range, or contradicts a file in the work directory. Or a sensor file
             is damaged.
         LockedError: Another process collects into the work directory.
-        OSError: A file cannot be read or written, or another file is damaged.
+        OSError: A file cannot be read or written, or a recorded trajectory is damaged.
         LedError, CameraError, LightError, NoContrastError: The sensor cannot be connected or read.
     """
     if config.twin:

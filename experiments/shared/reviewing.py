@@ -36,7 +36,7 @@ class Review:
 
 
 def review(config: Review) -> None:
-    """Do what the options select: change states of trajectories, check files, draw images, or list the trajectories.
+    """Confirm, discard or restore trajectories, check files, draw images, or list trajectories, as the options select.
 
     Raises:
         SystemExit: `check` is True, and a file is damaged.

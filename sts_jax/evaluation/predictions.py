@@ -21,8 +21,9 @@ class Predicted(NamedTuple):
     """The predicted last frames of n trajectories. Quantities that are not predicted are None.
 
     A prediction is a single frame, or a distribution that is given by k samples. In the second case, `visual`,
-    `tactile` and `pose` describe its centre. For re-rolls and state-space models, the images are means of the
-    distribution, the position in `pose` is a geometric median, and the orientation is that of a sample near the centre.
+    `tactile` and `pose` describe its centre. For state-space models and for re-rolls (simulations from the same start),
+    the images are means of the distribution, the position in `pose` is a geometric median, and the orientation is that
+    of a sample near the centre.
     """
 
     visual: np.ndarray | None = None  # visual images, (n, height, width, 3), float in [0, 1] or uint8

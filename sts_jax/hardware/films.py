@@ -128,8 +128,8 @@ class RecordedFilm(Film):
         if there < len(places):
             raise DamagedFileError(
                 f"{path} is truncated: it has {there} of the {len(places)} images that {FRAMES} lists for the {stream} "
-                f"stream. {_AGAIN.capitalize()}, or open {FRAMES}, and delete the last {len(places) - there} of the "
-                f"lines that contain stream {stream!r}."
+                f"stream. {_AGAIN.capitalize()}, or delete the lines of the missing images from {FRAMES}. They are the "
+                f"last lines with stream {stream!r} (number of lines: {len(places) - there})."
             )
 
     def image(self, index: int) -> Image:

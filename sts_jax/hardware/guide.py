@@ -229,8 +229,8 @@ def step(config: GuideConfig, state: State, observation: Observation) -> tuple[S
     Returns:
         The new state, and "initial", "final" or None. For "initial", the caller must save the previous pair of images
         as the pair of the held object. For "final", the caller must save the previous pair of images as the pair of the
-        object at rest. The new pair shows the object in the same place as the previous pair, so the object did not move
-        while the previous pair was taken. For None, there is nothing to save.
+        object at rest. For None, there is nothing to save. The previous pair is saved and not the new one, because the
+        new pair proves that the object did not move while the previous pair was taken.
     """
     moved = not state.window or not _same(config, state, state.window[0], observation)
     window = (observation,) if moved else (state.window[0], *state.window[1:][-_KEPT:], observation)

@@ -71,7 +71,7 @@ def matrix(code: Float[Array, "*n 12"]) -> Float[Array, "*n 3 3"]:
 
 
 def about_vertical(angle: Float[Array, "*n 2"]) -> Float[Array, "*n 3 3"]:
-    """Matrices of rotations about the z axis, from the cosine and the sine of each angle (last axis of `angle`)."""
+    """Matrices of rotations about the z axis. `angle[..., 0]` is the cosine of an angle, `angle[..., 1]` its sine."""
     cos, sin, zero = angle[..., 0], angle[..., 1], jnp.zeros_like(angle[..., 0])
     rows = [[cos, -sin, zero], [sin, cos, zero], [zero, zero, zero + 1]]
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)

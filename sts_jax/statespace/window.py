@@ -101,8 +101,7 @@ def cut(images: Float[Array, "n size size c"], window: Window, side: int) -> Flo
 
 
 def sample(images: Float[Array, "n side side c"], places: Float[Array, "n m 2"]) -> Float[Array, "n m c"]:
-    """Interpolate each image bilinearly at m places. The pixels of a border around the image count as 0.
-
+    """Interpolate each image bilinearly at m places. Pixels outside the image count as 0.
     Args:
         images: Square images.
         places: Column and row of each place (pixels). Whole numbers are pixel centres.
