@@ -76,10 +76,7 @@ class Args:
         if self.number < 1:
             raise ValueError(f"--number must be at least 1, got {self.number}")
         if not 0 <= self.long <= 1:
-            raise ValueError(
-                f"--long must be in [0, 1], got {self.long}. It is the share of faults of random duration that last "
-                "5 to 7 s"
-            )
+            raise ValueError(f"--long must be in [0, 1], got {self.long}")
         if unknown := set(self.only) - set(KINDS) - {KILLED}:
             raise ValueError(
                 f"--only has unknown kinds {sorted(unknown)}, but each kind must be one of: "

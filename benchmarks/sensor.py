@@ -436,10 +436,7 @@ def cost() -> None:
 
 
 def compilations(number: int = 100) -> None:
-    """Print how often `sense` compiles for `number` objects in total.
-
-    The objects are all public meshes. Random procedural objects are added until there are `number` objects.
-    """
+    """Print how often `sense` compiles for `number` different objects: the public meshes and procedural objects."""
     files = sorted(public_meshes().glob("*.obj"))
     bodies = []
     with warnings.catch_warnings():

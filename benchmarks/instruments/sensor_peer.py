@@ -59,7 +59,7 @@ class Lights:
         return found, mean
 
     def off_after(self, time_s: float) -> float | None:
-        """Return the time since which the lights have been off, or `time_s` if `time_s` is later.
+        """Return the time at which the lights were last switched off, or `time_s` if `time_s` is later.
         Return None if the lights are on now. All times are in seconds on `time.monotonic`.
         """
         with self._lock:

@@ -28,10 +28,10 @@ def main(config: Config, workdir: Path, *, only: Stage | None = None, own: Exten
         own: Your own loss, optimiser, logger, metrics, modalities (field `measurements`) and notes.
 
     Raises:
-        ValueError: A field of the configuration is out of range, or the work directory has another configuration. The
-            error is also raised if `own.measurements` is not empty although `config.model` is not "paper", or if a
-            model in the work directory was trained with other `own.notes`, or with an own loss or optimiser where this
-            run has none (or the other way round).
+        ValueError: A field of the configuration is out of range. The work directory has another configuration.
+            `own.measurements` is not empty, but `config.model` is not "paper". A model in the work directory was
+            trained with other `own.notes`. Or `own.loss` or `own.optimiser` is None, but a model in the work directory
+            was trained with such a function, or the reverse.
         FileNotFoundError: A stage before `only` has not been run.
         LockedError: Another process works in the work directory.
     """

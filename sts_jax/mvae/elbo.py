@@ -117,7 +117,7 @@ def loss(
             `config.condition` is 0.
         beta: Weight of the divergence of the posterior from the prior.
         asked: Modalities that are predicted for each subset. `all` predicts all modalities. `own` predicts only the
-            members of the subset, as in the paper's code. Here, absent modalities count as members.
+            members of the subset, as in the paper's code.
         absent: Names of modalities that are not inputs of any sample.
 
     Returns:

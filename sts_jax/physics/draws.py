@@ -76,7 +76,7 @@ def starts(
     A start contains an initial pose and hidden properties (friction, mass of the shell, and contents).
     `simulate` draws its starts from the same distribution. The starts of the two functions are independent, even if
     both functions receive the same key. Start j of body i depends on `key`, i, j and the body, not on the number of
-    other starts. In the scenario `Inclined`, a start can change if a body with more stable faces is added to `bodies`.
+    other starts. In the scenario `Inclined`, a start can also depend on the other bodies in `bodies`.
 
     Args:
         key: Key of the whole set, from `jax.random.key`.

@@ -248,8 +248,8 @@ def loss(
         The loss, and its terms by name without their weights. Terms are means over items, and items without an input do
         not count in the terms of this input. The terms `state` and `doubt` are sums of one mean for each image input of
         the model. The term `first` is a sum of one mean for each image input, or the mean for the views if `views` is
-        given. Only a part of the batch is rendered: the first frames (or
-        views) of the share `Config.drawn_first` of the items, and the last frames of the share `Config.drawn`.
+        given. Images are rendered for only a part of the items: first frames
+        (or views) for the share `Config.drawn_first`, and last frames for the share `Config.drawn`.
         The term `covered` is the sum of a mean for the first frame and a mean for the last frame. The term `state` is a
         squared error of state codes, and all other terms are in nats.
     """

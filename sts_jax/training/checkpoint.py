@@ -139,7 +139,9 @@ def verified(folder: Path) -> Path | None:
 
 
 def read(path: Path, like: State) -> State:
-    """Read a checkpoint. The result has only the parts that `like` has, for example no state of an optimiser.
+    """Read a checkpoint.
+
+    Parts of the state that `like` lacks are not returned. For example, `like` may lack the state of the optimiser.
 
     Args:
         path: Folder of the checkpoint.
