@@ -126,8 +126,8 @@ class Args:
         known = STUDIES[self.scenario].parts
         if unknown := [part for part in self.parts if part not in known]:
             raise ValueError(
-                f"{', '.join(unknown)}: the report for --scenario {self.scenario} has no such part. Each positional "
-                f"argument must be one of its parts, which are {', '.join(known)}"
+                f"the report for --scenario {self.scenario} has no part named {', '.join(unknown)}: give some of its "
+                f"parts ({', '.join(known)})"
             )
         unused = [f"--{name}" for name in ("objects", "again", "keep") if getattr(self, name) is not None]
         if self.soaked is not None and unused:
