@@ -15,7 +15,7 @@ pytestmark = pytest.mark.slow
             "--soaked a --keep b --objects 200",
             "--soaked provides the simulated trajectories: leave out --objects and --keep",
         ),
-        ("fill --scenario inclined", "the report for --scenario inclined has no part named fill: give some of its parts"),
+        ("fill --scenario inclined", "the report for --scenario inclined has no part named fill: give some of"),
     ],
 )
 def test_command_line_rejects_contradictory_options(options, reason):
