@@ -202,9 +202,9 @@ class ProvenFrames:
         """Take an image of one stream.
 
         If the lights are not set for `stream`, they are switched first. After the frame has arrived, a request is sent
-        to the controller. Its answer must confirm that the lights did not change between the time at which they were
-        set for `stream` and the request. If `stream` is "visual" and `then` is "tactile", the request also switches the
-        lights on. If `stream` is "tactile" and `then` is "visual", a second request switches the lights off.
+        to the controller. The controller's answer must confirm that the lights have not changed since they were set for
+        `stream`. If `stream` is "visual" and `then` is "tactile", the request also switches the lights on, after this
+        check. If `stream` is "tactile" and `then` is "visual", a second request switches the lights off.
 
         Args:
             stream: Stream of the image, "visual" (lights off) or "tactile" (lights on).

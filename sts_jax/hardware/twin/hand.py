@@ -53,9 +53,8 @@ class Hand(AutomaticPerson):
             view: Newest images and instruction. `hardware.collect` calls this method with each new view.
 
         Raises:
-            ValueError: The collection stays in the same stage for longer than the argument `patience_s` of `Hand`, or
-                no contact is detected in ten successive poses of the held object. The time does not count while `view`
-                contains a problem.
+            ValueError: The collection stays in the same stage for longer than the argument `patience_s` of `Hand`, and
+                `view.problem` is None. Or no contact is detected in ten successive poses of the held object.
         """
         super().show(view)
         entered, self._seen = view.stage is not self._seen, view.stage
