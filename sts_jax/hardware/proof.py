@@ -201,10 +201,9 @@ class ProvenFrames:
     def shot(self, stream: Stream, deadline: float, *, after_s: float = 0.0, then: Stream | None = None) -> Shot:
         """Take an image of one stream.
 
-        If the lights are not set for `stream`, they are switched first. After the frame has arrived, a request is sent
-        to the controller. The controller's answer must confirm that the lights have not changed since they were set for
-        `stream`. If `stream` is "visual" and `then` is "tactile", the request also switches the lights on, after this
-        check. If `stream` is "tactile" and `then` is "visual", a second request switches the lights off.
+        If the lights are not set for `stream`, they are switched first. After the frame has arrived, the controller is
+        asked for the state of the lights. Its answer must confirm that the lights have not changed since they were set
+        for `stream`. The lights are then set for the stream `then`, if it is given.
 
         Args:
             stream: Stream of the image, "visual" (lights off) or "tactile" (lights on).

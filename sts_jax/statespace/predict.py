@@ -117,12 +117,12 @@ def draw(
     num: int,
     drawn: int,
 ) -> Drawn:
-    """Sample final poses for each trajectory, and render layers for the first of these poses.
+    """Sample final poses for each trajectory, and render layers for a part of these poses.
 
-    The argument `num` is the number of poses. The argument `drawn` is the number of poses for which layers are
-    rendered. The layers are the outlines and colours of the objects, and the changes that the objects cause in the
-    tactile images. `compose` combines them with the images of the empty sensor, and returns complete images. The
-    arguments after `model` are the same as in `sample`.
+    The argument `num` is the number of poses. The argument `drawn` is the number of poses with layers. The layers are
+    the outlines and colours of the objects, and the changes that the objects cause in the tactile images. `compose`
+    combines them with the images of the empty sensor, and returns complete images. The arguments after `model` are the
+    same as in `sample`.
     """
     belief, final = calibration.predict(model, inputs, present, empty, condition, correction)
     end, appearance, outline = jax.random.split(key, 3)
