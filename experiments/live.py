@@ -197,7 +197,7 @@ def images(config: Config, source: Source) -> Iterator[hardware.Shot]:
 
 
 class Screen:
-    """Shows the images and predictions on the page, or a line of text in the terminal, and writes the `--save` file."""
+    """The outputs of the command: the web page or the lines in the terminal, and the file of `--save`."""
 
     def __init__(self, config: Config, source: Source, views: Views, page: LivePage | None):
         """Prepare the outputs.

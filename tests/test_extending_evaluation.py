@@ -98,7 +98,7 @@ def test_a_summary_without_the_metric_is_refused(items):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: evaluation.Metric("", height_error), "name of a metric is empty: give a name"),
+        (lambda: evaluation.Metric("", height_error), "the name of a metric must not be empty: give it a name"),
         (lambda: evaluation.Metric("height"), "'height' has neither `errors` nor `statistic`: give a function"),
         (lambda: evaluation.Metric("height", height_error, digits=-1), "`digits` must be a whole number >= 0, got -1"),
         (

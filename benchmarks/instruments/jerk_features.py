@@ -49,7 +49,7 @@ def look(body: objects.Body) -> tuple[np.ndarray, float, np.ndarray]:
 
 
 def sight(items: list[objects.Body]) -> Sight:
-    """Compute properties from the shapes of objects, such as the mass of each object when empty and when full."""
+    """Compute the profiles and the mass properties of objects."""
     return Sight(*map(np.stack, zip(*map(look, items), strict=True)))
 
 

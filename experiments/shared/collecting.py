@@ -239,7 +239,7 @@ class AutomaticTerminal(AutomaticPerson):
 
 
 class AutomaticPage(AutomaticPerson):
-    """A `Person` that confirms every trajectory by itself. A user can watch on a page and press its buttons."""
+    """The page for a collection in which every trajectory is confirmed automatically. Its buttons can still be used."""
 
     def __init__(self, page: Page):
         super().__init__()

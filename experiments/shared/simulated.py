@@ -74,7 +74,7 @@ class Hand(twin.Hand):
 
 
 def collect(config: Simulated) -> None:
-    """Collect trajectories of the twin until the work directory has `config.count` confirmed trajectories.
+    """Collect trajectories of the twin until the work directory has `config.count` of them.
 
     The twin (`ObjectScene`) simulates a fixed sequence of trajectories for each seed. A recorded trajectory keeps its
     number in this sequence. If a collection was interrupted, the next call continues it with the largest recorded

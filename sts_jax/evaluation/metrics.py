@@ -205,7 +205,7 @@ def coverage(samples: np.ndarray, target: np.ndarray, level: float = LEVEL) -> n
     predictor is calibrated, the true position has the distribution of the samples. Each rank r from 1 to k + 1 then has
     the same probability.
 
-    The result is `level (k + 1) - (r - 1)`, limited to [0, 1]. It is 1 for inner ranks, 0 for outer ranks, and a
+    The result is `level * (k + 1) - (r - 1)`, limited to [0, 1]. It is 1 for inner ranks, 0 for outer ranks, and a
     fraction for the rank at the border of the region. Points with equal mean distances get the mean of their results.
 
     Args:

@@ -100,7 +100,7 @@ class Metric:
 
     def __post_init__(self) -> None:
         if not self.name:
-            raise ValueError("name of a metric is empty: give a name for the summaries, such as 'height_error'")
+            raise ValueError("the name of a metric must not be empty: give it a name, such as 'height_error'")
         if self.errors is None and self.statistic is None:
             raise ValueError(
                 f"metric {self.name!r} has neither `errors` nor `statistic`: give a function for one of these two "

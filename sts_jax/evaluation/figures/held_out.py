@@ -32,9 +32,9 @@ def predictions(
 ) -> None:
     """Draw the first image, the true last image, the prediction and its samples for some held-out trajectories.
 
-    Each stream (visual or tactile) of a trajectory is a row. A red arrow on the first image shows `Scenario.drift`, the
-    velocity of a frictionless object relative to the pad. A velocity of 0 has no arrow. An arrow for 1 m/s is as long
-    as a quarter of the image's width.
+    Each stream (visual or tactile) of a trajectory is a row. The title of the row names the true outcome. A red arrow
+    on the first image shows `Scenario.drift`, the velocity of a frictionless object relative to the pad. A velocity of
+    0 has no arrow. An arrow for 1 m/s is as long as a quarter of the image's width.
 
     Args:
         path: The PNG file to write.
