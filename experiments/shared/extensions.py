@@ -60,7 +60,7 @@ class Extensions:
         return (*self.metrics, *(evaluation.measurement_error(own) for own in self.measurements))
 
     def described(self) -> list[Any]:
-        """Describe the metrics, the table columns and the additional modalities as JSON values that can be compared."""
+        """Describe all metrics, all table columns and the additional modalities as JSON values that can be compared."""
         fields = [{name: str(x) for name, x in vars(metric).items() if not callable(x)} for metric in self.scored]
         columns = [[column.heading, [metric.name for metric in column.metrics]] for column in self.columns]
         return [fields, columns, [[own.name, own.shape, float(own.scale)] for own in self.measurements]]

@@ -112,7 +112,8 @@ def restore(folder: Path, like: State) -> State | None:
 
     Raises:
         DamagedFileError: A file is damaged, missing or not listed in `manifest.json`.
-        ValueError: The checkpoint was written for another model or optimiser, or the folder has no `manifest.json`.
+        ValueError: The checkpoint was written for another model or optimiser. Or the folder has a checkpoint, but no
+            `manifest.json`.
     """
     path = verified(folder)
     return None if path is None else read(path, like)
