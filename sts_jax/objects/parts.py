@@ -125,8 +125,8 @@ def surface_gaps(
         Largest distance (m) by which the surface lies outside all parts, and largest distance (m) by which the parts
         lie outside the surface. The visible surface can sink into the pad by the first distance. A contact can lie
         outside the visible surface by up to the second distance, such as in the hollow of a bowl. If the visible
-        surface is not closed, it has no outside. The second distance is then the
-    largest distance from a point on the surface of the parts to the surface of the object.
+        surface is not closed, it has no outside. The second distance is then the largest distance from a point on the
+        surface of the parts to the visible surface.
     """
     points = np.concatenate([np.unique(vertices[faces].reshape(-1, 3), axis=0), _points(vertices[faces], 10_000)])
     shapes = [ConvexHull(hull) for hull in hulls]
