@@ -276,7 +276,7 @@ def test_contents_lie_in_all_directions_except_in_variants() -> None:
     assert wide.min() < 0.32
     assert wide.max() > 0.88
     assert physics.variant(physics.Perturbed(), "off-centre").tilt == np.pi
-    with pytest.raises(ValueError, match="name is 'none', but it must be one of default"):
+    with pytest.raises(ValueError, match="the name of the variant is 'none', but it must be one of default"):
         physics.variant(SCENARIO, "none")
 
 

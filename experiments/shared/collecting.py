@@ -60,7 +60,7 @@ def device(config: Collect) -> tuple[hardware.STS, EmptyPad | None]:
     Raises:
         ValueError: An option is missing or out of range, or contradicts the sensor file.
         SensorFileError: The sensor file is damaged, or belongs to another camera.
-        OSError: The sensor file cannot be read.
+        OSError: The sensor file does not exist.
     """
     if config.count is not None and config.count < 1:
         raise ValueError(f"--count must be >= 1, got {config.count}")

@@ -84,8 +84,8 @@ def collect(config: Simulated) -> None:
         ValueError: The work directory contains data of another sensor, or of a twin with another seed, image size or
             LED levels.
         LockedError: Another process collects into the work directory.
-        SensorFileError: The content of the sensor file in the work directory is invalid.
-        OSError: A file cannot be written, or the sensor file cannot be read.
+        SensorFileError: The sensor file in the work directory is damaged.
+        OSError: A file cannot be written.
     """
     dataset = config.workdir / "dataset"
     if (dataset / hardware.recordings.SESSION).exists() and len(hardware.load_recordings(dataset)) >= config.count:

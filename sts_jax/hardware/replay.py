@@ -106,7 +106,6 @@ class Replay:
         None if the recording has no such file.
 
         Raises:
-            OSError: The file cannot be read or is not JSON.
             SensorFileError: The file is damaged, incomplete or of another version. Or a background image is missing or
                 damaged.
         """

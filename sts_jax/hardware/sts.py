@@ -153,7 +153,6 @@ class STS:
 
         Raises:
             FileNotFoundError: There is no such file.
-            OSError: The file cannot be read or is not JSON.
             SensorFileError: The file is damaged, or has no description of a camera and lights.
             WrongDeviceError: The camera is not the camera that the file names. `connect` raises the same error if the
                 LED controller is not the controller that the file names.
@@ -367,8 +366,8 @@ class STS:
                 Each switch costs the settling time.
 
         Returns:
-            The iterator. Each step waits for one image, for at most the sensor's `timeout_s`. The time of a
-            reconnection does not count.
+            The iterator. Each step waits for one image, for at most the sensor's `timeout_s`. If the LED controller is
+            lost, the limit is extended by the duration of the reconnection.
 
         Raises:
             ValueError: An argument is out of range.

@@ -389,7 +389,7 @@ def variant(scenario: _AnyScenario, name: str) -> _AnyScenario:
         "off-centre": {"tilt": math.pi},
     }
     if name not in changes:
-        raise ValueError(f"name is {name!r}, but it must be one of {', '.join(changes)}")
+        raise ValueError(f"the name of the variant is {name!r}, but it must be one of {', '.join(changes)}")
     lacking = sorted(set(changes[name]) - {field.name for field in dataclasses.fields(scenario)})
     if lacking:
         raise ValueError(
