@@ -49,7 +49,7 @@ def make(config: Config) -> twin.Twin:
 
     Raises:
         ValueError: An option is out of range.
-        OSError: The sensor file does not exist, or a file cannot be written.
+        OSError: The sensor file cannot be read, or a file cannot be written.
     """
     if config.object_class not in sts.objects.CATEGORIES:
         classes = ", ".join(sts.objects.CATEGORIES)

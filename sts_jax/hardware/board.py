@@ -111,8 +111,8 @@ def board_image(board: Board = Board(), *, outline: tuple[float, float] = (0.15,
         )
     if any(f > limit for f, limit in zip(frame, limits, strict=True)):
         raise ValueError(
-            f"the frame around the board has the size outline={_mm(outline)}, but it must be at most {_PAGE[0] - 10} mm x "
-            f"{_PAGE[1] - 60} mm to fit on the A4 page: use a smaller outline"
+            f"the frame around the board has the size outline={_mm(outline)}, but it must be at most "
+            f"{_PAGE[0] - 10} mm x {_PAGE[1] - 60} mm to fit on the A4 page: use a smaller outline"
         )
     page = np.full((_PAGE[1] * _PIXELS_PER_MM, _PAGE[0] * _PIXELS_PER_MM), 255, np.uint8)
     left, top = (page.shape[1] - frame[0]) // 2, 10 * _PIXELS_PER_MM
