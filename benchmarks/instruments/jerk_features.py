@@ -49,7 +49,7 @@ def look(body: objects.Body) -> tuple[np.ndarray, float, np.ndarray]:
 
 
 def sight(items: list[objects.Body]) -> Sight:
-    """Compute the profiles and the mass properties of objects."""
+    """Compute a `Sight`, which contains properties of several objects."""
     return Sight(*map(np.stack, zip(*map(look, items), strict=True)))
 
 

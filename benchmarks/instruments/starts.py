@@ -160,9 +160,9 @@ def kept(folder: Path | None, name: str, make: Callable[[], Starts]) -> Starts:
     Each initial state is stored together with the outcome of its trajectory.
 
     Args:
-        folder: Folder of the file. None: make the starts and write nothing.
+        folder: Folder of the file. None: make the initial states and write nothing.
         name: Name of the file, without `.npz`.
-        make: Function that makes the starts.
+        make: Function that makes the initial states and their outcomes.
     """
     path = None if folder is None else folder / f"{name}.npz"
     if path is not None and path.exists():

@@ -137,7 +137,7 @@ class Pictures:
 def take(pictures: Pictures, sensor: hardware.STS, number: int, every: float | None, say: Say = print) -> Pictures:
     """Take pictures until the board was found in enough of them. Pictures in which it was not found are discarded.
 
-    Each picture that is kept is written to the folder at once.
+    Each picture that is kept is immediately written to `pictures.folder`.
 
     Args:
         pictures: Pictures of an earlier run, which count towards `number`. If the picture of the board on the pad,

@@ -30,7 +30,7 @@ def main(config: Config, workdir: Path, *, only: Stage | None = None, own: Exten
     Raises:
         ValueError: A field of the configuration is out of range. The work directory has another configuration.
             `own.measurements` is not empty, but `config.model` is not "paper". A model in the work directory was
-            trained with other extensions (`Extensions` describes the changes that are not detected).
+            trained with other values in `own`, as far as this can be detected.
         FileNotFoundError: A stage before `only` has not been run.
         LockedError: Another process works in the work directory.
     """

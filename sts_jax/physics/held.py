@@ -19,8 +19,8 @@ def held_wrench(gel: tactile.Gel, body: Body, pose: Float[np.ndarray, "7"], forc
     The hand balances all moments, so the object keeps its orientation. The object sinks until the pressure of the gel
     carries `force`. The pressure in a cell of the gel's grid is `p = k max(0, d - h)`. Here k is `gel.stiffness`, d is
     the depth of the object's lowest point, and h is the height of the object's underside above this point. The moment
-    follows from the pressures of all cells. `sts_jax.sense` finds the same depth d from
-    the returned wrench, if its argument `pose` is not too far above the gel (`Gel.max_depth`).
+    follows from the pressures of all cells. The function `sts_jax.sense` computes the same depth d from the returned
+    wrench, if the object touches the gel or is close above it.
 
     If the object would have to sink deeper than the gel allows (`Gel.max_depth`), the object stops just before this
     depth. The returned force is then smaller than `force`. This happens, for instance, if only a sharp

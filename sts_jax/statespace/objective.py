@@ -248,7 +248,7 @@ def loss(
         The loss, and its terms by name without their weights. Terms are means over items, and items without an input do
         not count in the terms of this input. The terms `state`, `doubt` and `first` are sums over the
         image inputs of the model. If `views` is given, `first` is computed for the visual images of the views instead.
-        To save time, the model draws images for only a part of the items: first frames (or views) for the share
+        To save time, the decoder renders images for only a part of the items: first frames (or views) for the share
         `Config.drawn_first`, and last frames for the share `Config.drawn`.
         The term `covered` is the sum of a mean for the first frame and a mean for the last frame. The term `state` is a
         squared error of state codes, and all other terms are in nats.
