@@ -245,8 +245,9 @@ def test_an_invalid_split_is_refused(copied, change, message):
     split = json.loads(path.read_text())
     change(split)
     path.write_text(json.dumps(split))
-    with pytest.raises(storage.DamagedFileError, match=rf"split\.json.*{message}"):
-        dataset.load(copied)
+    for use in (dataset.load, lambda folder: dataset.collect(SMALL, sts.Sensor(), folder)):
+        with pytest.raises(storage.DamagedFileError, match=rf"split\.json.*{message}"):
+            use(copied)
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,7 @@ from sts_jax.dataset.collection import (
     split_objects,
     symmetries_of,
 )
+from sts_jax.dataset.loading import read_split
 from sts_jax.dataset.rendering import render
 from sts_jax.sensor import Sensor
 from sts_jax.storage import claim, digest, lock, read_json, write_json
@@ -100,7 +101,9 @@ def _collect(
     claim(path, description)
     claim(folder / "sensor.json", constants)
     split = folder / "split.json"
-    if not split.exists():  # the split of an older version of this library is kept
+    if split.exists():  # a split that an older version of this library made is kept
+        read_split(split, collection.num_objects)
+    else:
         write_json(split, {name: [int(i) for i in part] for name, part in split_objects(collection).items()})
     made = Collected(0, ())
     for index in range(collection.num_shards):

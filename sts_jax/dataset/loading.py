@@ -375,7 +375,7 @@ def load(folder: str | Path) -> Dataset:
     collection = _read(path)
     records.check_format(collection, folder)
     objects, each = (_whole_number(collection, name, path) for name in ("num_objects", "objects_per_shard"))
-    split = _read_split(folder / "split.json", objects)
+    split = read_split(folder / "split.json", objects)
     made_of, seen_by = digest(collection), digest(_read(folder / "sensor.json"))
     count = -(-objects // each)
     shards, parts = [], []
@@ -433,8 +433,20 @@ def _whole_number(collection: dict, name: str, path: Path) -> int:
     return value
 
 
-def _read_split(path: Path, num_objects: int) -> dict[str, np.ndarray]:
-    """Read `split.json`, and check that each object is in exactly one part."""
+def read_split(path: Path, num_objects: int) -> dict[str, np.ndarray]:
+    """Read `split.json`, and check that each object is in exactly one part.
+
+    Args:
+        path: Path of the file.
+        num_objects: Number of objects in the dataset.
+
+    Returns:
+        Indices of the objects, int `(n,)`, for each of `train`, `validation` and `test`.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        DamagedFileError: The file is damaged. The message names it and the remedy.
+    """
     remedy = f"delete {path} and start the collection again, which writes the file anew"
     content = _read(path, remedy)
     if not isinstance(content, dict) or set(content) != set(PARTS):
