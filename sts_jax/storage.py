@@ -9,9 +9,9 @@ import json
 import os
 import platform
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import filelock
 import numpy as np
@@ -245,6 +245,85 @@ def digest(content: Any) -> str:
     """SHA-256 of an object of JSON types, in hexadecimal digits, independent of the order of its keys."""
     plain = json.loads(json.dumps(content))
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
+
+
+MANIFEST = "manifest.json"
+
+
+class Manifest(NamedTuple):
+    """The files of a folder with their checksums, and what else its writer records, such as a step number."""
+
+    files: dict[str, str]  # SHA-256 in hexadecimal digits, by path relative to the folder
+    facts: dict[str, Any]  # JSON values
+
+
+def checksums(folder: Path, names: Iterable[str]) -> dict[str, str]:
+    """SHA-256 of some files of a folder, by their paths relative to the folder."""
+    return {name: sha256(folder / name) for name in names}
+
+
+def write_manifest(folder: Path, files: Mapping[str, str], facts: Mapping[str, Any] | None = None) -> Manifest:
+    """Write `manifest.json`, after all other files of the folder. The file also has a checksum of its own content.
+
+    Args:
+        folder: The folder.
+        files: SHA-256 by relative path, from `checksums`. For files that have not changed, pass the values of the
+            previous manifest, so that damage since then is not hidden.
+        facts: Further JSON values.
+    """
+    content = {"files": dict(files), "facts": dict(facts or {})}
+    write_json(folder / MANIFEST, {**content, "checksum": digest(content)})
+    return Manifest(**content)
+
+
+def read_manifest(folder: Path, remedy: str) -> Manifest | None:
+    """Read `manifest.json`, without comparing the files. None if the folder has no such file.
+
+    Args:
+        folder: The folder.
+        remedy: Text at the end of the error message, with the remedy for a damaged file.
+
+    Raises:
+        DamagedFileError: The manifest is damaged or was edited.
+    """
+    path = folder / MANIFEST
+    if not path.exists():
+        return None
+    content = read_json(path, remedy)
+    known = isinstance(content, dict) and content.keys() == {"files", "facts", "checksum"}
+    if not known or content.pop("checksum") != digest(content):
+        raise DamagedFileError(f"{path} is damaged, or was written by another version of sts_jax: {remedy}.")
+    return Manifest(**content)
+
+
+def verify(folder: Path, manifest: Manifest, remedy: str, names: Iterable[str] | None = None) -> None:
+    """Compare files of a folder with their checksums in its manifest.
+
+    Args:
+        folder: The folder.
+        manifest: Its manifest.
+        remedy: Text at the end of the error message.
+        names: Relative paths of the files to compare. None: all files of the manifest.
+
+    Raises:
+        DamagedFileError: A file is missing, cannot be read, has other content, or is not in the manifest. The message
+            names the file.
+    """
+    for name in manifest.files if names is None else names:
+        path = folder / name
+        if name not in manifest.files:
+            raise DamagedFileError(f"{path} is not listed in {MANIFEST}: {remedy}.")
+        try:
+            actual = sha256(path)
+        except FileNotFoundError:
+            raise DamagedFileError(f"{path} is missing, but {MANIFEST} lists it: {remedy}.") from None
+        except OSError as error:
+            raise DamagedFileError(f"{path} cannot be read ({error}): {remedy}.") from error
+        if actual != manifest.files[name]:
+            raise DamagedFileError(
+                f"{path} is not the file that {MANIFEST} lists (its SHA-256 differs). It was edited, exchanged or "
+                f"damaged: {remedy}."
+            )
 
 
 OWNER = ".lock-owner"  # file in a locked folder with the number of the process that locked it
