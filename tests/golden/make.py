@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import sts_jax as sts
@@ -19,7 +20,7 @@ def inputs() -> dict[str, np.ndarray]:
     body = sts.objects.make(jax.random.key(3), "bottle")
     pose = np.array([0.01, -0.015, 0.05, 0.8, 0.5, 0.2, 0.27], np.float32)
     pose[3:] /= np.linalg.norm(pose[3:])
-    frame = sts.sense(sts.Sensor(), body, pose, resolution=(128, 128))
+    frame = sts.sense(sts.Sensor(), body, jnp.asarray(pose), resolution=(128, 128))
     return {"visual": np.round(np.asarray(frame.visual) * 255).astype(np.uint8), "pose": pose}
 
 
