@@ -6,10 +6,9 @@ import sys
 import numpy as np
 
 from sts_jax.hardware.leds import Lit
+from sts_jax.hardware.proof import Settling, Shot
 from sts_jax.hardware.recorder import Recorder
 from sts_jax.hardware.session import Origin
-from sts_jax.hardware.settling import Settling
-from sts_jax.hardware.shots import Shot
 
 SIZE = (48, 64)
 ORIGIN = Origin("camera", "0123", SIZE[1], SIZE[0], (255, 255, 255, 255))

@@ -8,8 +8,8 @@ import warnings
 import numpy as np
 
 from sts_jax.hardware.leds import Lit
+from sts_jax.hardware.proof import Pair, Shot
 from sts_jax.hardware.session import Origin, Session
-from sts_jax.hardware.shots import Pair, Shot
 
 SIZE = (48, 64)
 ORIGIN = Origin("camera", "0123", SIZE[1], SIZE[0], (255, 255, 255, 255))

@@ -18,7 +18,7 @@ from benchmarks.instruments.sensor_peer import DARK, LIT, Lights, SeenController
 from experiments import commission
 from experiments.shared import backgrounds, boards, commissioning
 from sts_jax import hardware
-from sts_jax.hardware import Device, capture
+from sts_jax.hardware import Device, opencv
 
 WIDTH, HEIGHT = 640, 480
 PINHOLE = sts.Sensor().camera
@@ -187,7 +187,7 @@ def test_an_interrupted_run_resumes_and_writes_a_file_that_opens_the_sensor(peer
         hardware.STS.from_file(config.out, camera="http://127.0.0.1:9/video", leds=peer.path)
     with pytest.raises(hardware.PortNotFoundError, match="EMULATED was not found"):
         hardware.STS.from_file(config.out).connect()
-    camera = hardware.Camera(hardware.CameraConfig("http://127.0.0.1:9/video"))
+    camera = hardware.OpenCVCamera(hardware.CameraConfig("http://127.0.0.1:9/video"))
     with pytest.raises(ValueError, match=r"board/camera.json was made with camera = "):
         commissioning.claim_pictures(config, camera)
     with (
@@ -217,7 +217,7 @@ def test_another_controller_on_the_port_is_refused(tmp_path, peer):
 def test_the_controller_is_found_by_its_own_serial_number(tmp_path, monkeypatch):
     peers = [Peer(tmp_path / name, serial_number=name) for name in ("AAA", "BBB")]
     found = [hardware.Port(str(peer.path), "", None, 1, 1) for peer in peers]
-    monkeypatch.setattr(hardware.ports, "find_controllers", lambda: found)
+    monkeypatch.setattr(hardware.leds, "find_controllers", lambda: found)
     try:
         with hardware.Leds.find("BBB") as leds:
             assert leds.port == str(tmp_path / "BBB")
@@ -315,7 +315,7 @@ def test_covered_parts_are_named():
 # ---- The exposure
 
 
-class Metered(hardware.Camera):
+class Metered(hardware.OpenCVCamera):
     """A device whose images are as bright as its exposure times the light, up to 255."""
 
     def __init__(self, light, settable=True):
@@ -337,7 +337,7 @@ class Metered(hardware.Camera):
 
 @pytest.fixture
 def no_lag(monkeypatch):
-    monkeypatch.setattr(hardware.exposure, "LAG_S", 0.0)
+    monkeypatch.setattr(hardware.sts, "LAG_S", 0.0)
 
 
 @pytest.mark.parametrize("light", [0.8, 1.3, 40.0])
@@ -393,8 +393,8 @@ class Video:
 @pytest.mark.slow
 def test_each_stream_of_a_device_has_its_exposure(peer, config, monkeypatch, capsys):
     device = Video(peer.leds.controller)
-    monkeypatch.setattr(capture, "check_source", lambda config: None)
-    monkeypatch.setattr(capture, "_open", lambda config: device)
+    monkeypatch.setattr(opencv, "check_source", lambda config: None)
+    monkeypatch.setattr(opencv, "_open", lambda config: device)
     measure_briefly(monkeypatch)
     config = dataclasses.replace(config, camera="0", width=64, height=48, ideal_lens=160.0, every=0.0)
     commission.main(config)

@@ -17,7 +17,6 @@ import pytest
 
 from benchmarks.instruments.camera_server import SIZE, MotionJpeg, draw, number_of
 from sts_jax.hardware import (
-    Camera,
     CameraBusyError,
     CameraConfig,
     CameraError,
@@ -30,13 +29,14 @@ from sts_jax.hardware import (
     EndOfVideoError,
     FrameSizeError,
     FrozenCameraError,
+    OpenCVCamera,
     StaleFrameError,
-    capture,
-    devices,
     find_cameras,
-    frames,
     is_black,
-    settings,
+    opencv,
+)
+from sts_jax.hardware import (
+    camera as cameras,
 )
 
 FRAMES = 40  # of the test video
@@ -88,7 +88,7 @@ def config(source, **changes):
 
 
 def connected(server, **changes):
-    return Camera(config(server.url, **changes)).connect(warmup_s=0)
+    return OpenCVCamera(config(server.url, **changes)).connect(warmup_s=0)
 
 
 def next_error(camera, kind, timeout_ms=400):
@@ -207,7 +207,7 @@ def test_lost_frames_are_counted_from_the_times(server):
 
 
 def test_gaps_in_the_times_are_lost_frames():
-    pace = frames.Pace(None)
+    pace = opencv.Pace(None)
     numbers = [n for n in range(60) if n not in (20, 30, 31, 40, 41, 42)]
     estimates = {n: pace.arrived(0.05 * n + 0.002 * (n % 3)) for n in numbers}
     assert {n: lost for n, lost in estimates.items() if lost} == {21: 1, 32: 2, 43: 3}
@@ -216,7 +216,7 @@ def test_gaps_in_the_times_are_lost_frames():
 
 
 def test_frames_that_are_only_late_are_not_counted_as_lost():
-    pace = frames.Pace(None)
+    pace = opencv.Pace(None)
     times = [0.1 * i for i in range(20)] + [2.3, 2.31, 2.32, 2.33, 2.4]  # four frames arrive together
     estimates = [pace.arrived(time_s) for time_s in times]
     assert estimates[20] == 3
@@ -227,7 +227,7 @@ def test_frames_that_are_only_late_are_not_counted_as_lost():
 
 def test_frames_that_a_network_held_back_are_known():
     """The frames of 1.0 to 1.5 s arrive together at 1.52 s, and then the camera misses one."""
-    pace, held = frames.Pace(None), []
+    pace, held = opencv.Pace(None), []
     times = [*0.1 * np.arange(10), *(1.52 + 0.002 * np.arange(6)), 1.6, 1.7, 1.9, 2.0]
     for time_s in times:
         pace.arrived(time_s)
@@ -236,7 +236,7 @@ def test_frames_that_a_network_held_back_are_known():
 
 
 def test_frames_that_a_network_held_back_do_not_change_the_measured_rate():
-    pace = frames.Pace(None)
+    pace = opencv.Pace(None)
     for time_s in [*0.1 * np.arange(10), *(5.0 + 0.002 * np.arange(41)), *(5.1 + 0.1 * np.arange(9))]:
         pace.arrived(time_s)
     assert pace.rate == pytest.approx(10, rel=0.01)
@@ -244,7 +244,7 @@ def test_frames_that_a_network_held_back_do_not_change_the_measured_rate():
 
 
 def test_a_camera_that_becomes_faster_after_a_gap_is_measured_again():
-    pace = frames.Pace(None)
+    pace = opencv.Pace(None)
     for time_s in [*0.1 * np.arange(10), *(1.5 + 0.02 * np.arange(100))]:
         pace.arrived(time_s)
     assert pace.rate == pytest.approx(50)
@@ -252,7 +252,7 @@ def test_a_camera_that_becomes_faster_after_a_gap_is_measured_again():
 
 
 def test_the_first_frame_after_an_interruption_may_have_waited():
-    pace, delayed = frames.Pace(10.0), []
+    pace, delayed = opencv.Pace(10.0), []
     for time_s in (0.0, 0.1, 0.2):
         pace.arrived(time_s)
     pace.interrupted()
@@ -263,7 +263,7 @@ def test_the_first_frame_after_an_interruption_may_have_waited():
 
 
 def test_jitter_is_not_counted_as_loss():
-    pace = frames.Pace(10.0)
+    pace = opencv.Pace(10.0)
     times = 0.1 * np.arange(200) + np.random.default_rng(0).uniform(0, 0.06, 200)
     times[50:53] = [5.16, 5.2, 5.25]  # late, and made up for
     for time_s in times:
@@ -408,7 +408,7 @@ def test_disconnect_ends_a_read_in_another_thread(server):
 
 
 def test_a_camera_connects_again_after_disconnect(server):
-    camera = Camera(config(server.url))
+    camera = OpenCVCamera(config(server.url))
     for _ in range(3):
         assert camera.connect(warmup_s=0) is camera
         assert camera.is_connected
@@ -512,14 +512,14 @@ def test_a_password_is_not_shown():
 
 def environment():
     """The environment of another process that imports the same package."""
-    path = str(Path(capture.__file__).parents[2])
+    path = str(Path(opencv.__file__).parents[2])
     return os.environ | {"PYTHONPATH": os.pathsep.join([path, os.environ.get("PYTHONPATH", "")])}
 
 
 OTHER_PROCESS = """
 import sys
-from sts_jax.hardware import Camera, CameraConfig
-camera = Camera(CameraConfig(sys.argv[1], width=160, height=120, lock=False)).connect(0)
+from sts_jax.hardware import CameraConfig, OpenCVCamera
+camera = OpenCVCamera(CameraConfig(sys.argv[1], width=160, height=120, lock=False)).connect(0)
 print("connected", flush=True)
 sys.stdin.read()
 """
@@ -553,26 +553,26 @@ def test_a_camera_that_is_open_twice_in_one_process_is_refused(server):
 def test_a_file_that_is_no_video_is_named(tmp_path, name, content, message):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(CameraOpenError, match=message):
-        Camera(config(tmp_path / name)).connect()
+        OpenCVCamera(config(tmp_path / name)).connect()
 
 
 def test_a_missing_source_is_named(tmp_path):
     with pytest.raises(CameraNotFoundError, match=r"no file .*gone\.avi.*Check the path"):
-        Camera(config(tmp_path / "gone.avi")).connect()
+        OpenCVCamera(config(tmp_path / "gone.avi")).connect()
     with pytest.raises(CameraNotFoundError, match=r"no device /dev/video987\. (No cameras|Cameras) "):
-        Camera(config(987)).connect()
+        OpenCVCamera(config(987)).connect()
     with pytest.raises(CameraOpenError, match="is a folder"):
-        Camera(config(tmp_path)).connect()
+        OpenCVCamera(config(tmp_path)).connect()
     with pytest.raises(CameraOpenError, match="/dev/null is not a camera"):
-        Camera(config("/dev/null")).connect()
+        OpenCVCamera(config("/dev/null")).connect()
 
 
 def test_a_device_without_permission_names_the_group(monkeypatch, video):
     monkeypatch.setattr(os, "access", lambda path, mode: False)  # a test may run as root, who may open everything
     with pytest.raises(CameraPermissionError, match=r"/dev/null: add your user to the group video"):
-        Camera(config("/dev/null")).connect()
+        OpenCVCamera(config("/dev/null")).connect()
     with pytest.raises(CameraPermissionError, match="chmod"):
-        Camera(config(video)).connect()
+        OpenCVCamera(config(video)).connect()
 
 
 @pytest.mark.parametrize(
@@ -597,7 +597,7 @@ def test_invalid_values_are_named(changes, message):
 
 
 def test_a_file_is_read_completely_and_then_ends(video):
-    with Camera(config(video, realtime=False)) as camera:
+    with OpenCVCamera(config(video, realtime=False)) as camera:
         read, error = read_file(camera, pauses=(0.0, 0.002, 0.004))
         assert "40 frames" in str(error)
         assert not camera.is_connected
@@ -608,7 +608,7 @@ def test_a_file_is_read_completely_and_then_ends(video):
 
 
 def test_a_file_is_played_at_its_own_rate(video):
-    with Camera(config(video, buffer=FRAMES)) as camera:
+    with OpenCVCamera(config(video, buffer=FRAMES)) as camera:
         read, _ = read_file(camera)
         lost = camera.statistics.dropped
     numbers = np.array([number_of(frame.image) for frame in read])
@@ -619,7 +619,7 @@ def test_a_file_is_played_at_its_own_rate(video):
 
 
 def test_a_file_has_the_rate_asked_for_and_reports_frames_left_out(video):
-    with Camera(config(video, fps=2000.0, buffer=FRAMES)) as camera:
+    with OpenCVCamera(config(video, fps=2000.0, buffer=FRAMES)) as camera:
         read, _ = read_file(camera)
     numbers = [number_of(frame.image) for frame in read]
     left_out = [0, *np.diff(numbers) - 1]
@@ -633,7 +633,7 @@ def test_a_file_in_its_own_size_is_rgb(tmp_path):
     for _ in range(3):
         writer.write(np.full((48, 64, 3), (0, 0, 255), np.uint8))
     writer.release()
-    with Camera(CameraConfig(path, width=None, height=None, realtime=False)) as camera:
+    with OpenCVCamera(CameraConfig(path, width=None, height=None, realtime=False)) as camera:
         image = camera.read().image
     assert image.shape == (48, 64, 3)
     assert image[..., 0].min() > 240
@@ -686,13 +686,13 @@ def device(monkeypatch):
     automatic = {"AUTO_EXPOSURE": 3, "EXPOSURE": 157, "AUTO_WB": 1, "WB_TEMPERATURE": 4600}
     size = {"FRAME_WIDTH": 0, "FRAME_HEIGHT": 0, "FPS": 100, "POS_MSEC": 5e6, "FOURCC": 0}
     device = Device(**automatic, **size)
-    monkeypatch.setattr(capture, "check_source", lambda config: None)
-    monkeypatch.setattr(capture, "_open", lambda config: device)
+    monkeypatch.setattr(opencv, "check_source", lambda config: None)
+    monkeypatch.setattr(opencv, "_open", lambda config: device)
     return device
 
 
 def test_a_device_is_locked_after_its_warm_up_and_again_after_a_loss(device):
-    with Camera(config(0, lock=True, exposure=80, fourcc="MJPG")).connect(warmup_s=0.05) as camera:
+    with OpenCVCamera(config(0, lock=True, exposure=80, fourcc="MJPG")).connect(warmup_s=0.05) as camera:
         assert camera.refused == ()
         assert camera.read().dropped == 0
         assert [device.get(getattr(cv2, f"CAP_PROP_{name}")) for name in ("AUTO_EXPOSURE", "EXPOSURE")] == [1, 80]
@@ -708,7 +708,7 @@ def test_a_device_is_locked_after_its_warm_up_and_again_after_a_loss(device):
 
 
 def test_the_exposure_of_a_device_is_set_between_frames_and_again_after_a_loss(device):
-    with Camera(config(0, lock=True)).connect(warmup_s=0.05) as camera:
+    with OpenCVCamera(config(0, lock=True)).connect(warmup_s=0.05) as camera:
         assert camera.locked == {"exposure": 157, "white_balance": 4600}
         assert camera.set_exposure(80.4) == 80
         assert camera.locked == {"exposure": 80, "white_balance": 4600}
@@ -733,7 +733,7 @@ def test_the_exposure_of_a_stream_is_left_to_its_server(server):
 def test_a_device_that_refuses_a_setting_is_warned_about(device):
     device.stuck = {cv2.CAP_PROP_AUTO_WB}
     with pytest.warns(UserWarning, match=r"camera 0 did not accept a setting. AUTO_WB: asked for 0, found 1"):
-        camera = Camera(config(0, lock=True)).connect(warmup_s=0)
+        camera = OpenCVCamera(config(0, lock=True)).connect(warmup_s=0)
     assert camera.refused == ("AUTO_WB: asked for 0, found 1",)
     camera.disconnect()
 
@@ -742,12 +742,12 @@ def test_a_device_without_the_size_names_both(device):
     device.stuck = {cv2.CAP_PROP_FRAME_WIDTH}
     device.values[cv2.CAP_PROP_FRAME_WIDTH] = 640
     with pytest.raises(FrameSizeError, match=r"640 x 120 pixels, but 160 x 120 .*v4l2-ctl -d /dev/video0"):
-        Camera(config(0)).connect()
+        OpenCVCamera(config(0)).connect()
 
 
 def test_settings_are_locked_at_their_current_values():
     driver = Driver(AUTO_EXPOSURE=3, EXPOSURE=157, AUTO_WB=1, WB_TEMPERATURE=4600, GAIN=5)
-    held, refused = settings.lock(driver, {}, current=True)
+    held, refused = opencv.lock(driver, {}, current=True)
     assert held == {"exposure": 157, "white_balance": 4600}
     assert refused == []
     assert driver.get(cv2.CAP_PROP_AUTO_EXPOSURE) == 1
@@ -756,14 +756,14 @@ def test_settings_are_locked_at_their_current_values():
 
 def test_settings_take_the_values_asked_for():
     driver = Driver(AUTO_EXPOSURE=3, EXPOSURE=157, AUTO_WB=1, WB_TEMPERATURE=4600, GAIN=5)
-    held, refused = settings.lock(driver, settings.asked(config(0, exposure=80, gain=2)))
+    held, refused = opencv.lock(driver, opencv.asked(config(0, exposure=80, gain=2)))
     assert (held, refused) == ({"exposure": 80, "gain": 2}, [])
     assert driver.get(cv2.CAP_PROP_AUTO_WB) == 1
 
 
 def test_a_refused_setting_is_named_with_both_values():
     driver = Driver(stuck=["AUTO_EXPOSURE"], AUTO_EXPOSURE=3, EXPOSURE=157)
-    _, refused = settings.lock(driver, {"exposure": 80.0, "focus": 3.0}, current=True)
+    _, refused = opencv.lock(driver, {"exposure": 80.0, "focus": 3.0}, current=True)
     assert [str(refusal) for refusal in refused] == [
         "AUTO_EXPOSURE: asked for 1, found 3",
         "EXPOSURE: asked for 80, found 157",
@@ -790,14 +790,14 @@ def test_cameras_are_found_by_serial_number_port_and_number(tmp_path):
     assert [Path(camera.device).name for camera in found] == ["video0", "video2", "video10"]
     assert [camera.users for camera in found] == [(), (os.getpid(),), ()]
     assert "Camera 2, in use by process" in str(found[1])
-    assert devices.stable_path(str(dev / "video0"), tmp_path) == found[0].source
-    assert devices.stable_path(str(dev / "video2"), tmp_path) == str(dev / "video2")
+    assert cameras.stable_path(str(dev / "video0"), tmp_path) == found[0].source
+    assert cameras.stable_path(str(dev / "video2"), tmp_path) == str(dev / "video2")
 
 
 def test_nodes_without_images_are_recognised():
     def capability(whole, own):
         return struct.pack("16s32s32s3I3I", b"uvcvideo", b"Camera", b"usb", 0x60000, whole, own, 0, 0, 0)
 
-    assert devices.captures(capability(0x84A00001, 0x04200001))
-    assert not devices.captures(capability(0x84A00001, 0x04A00000))  # metadata
-    assert devices.captures(capability(0x04000001, 0))  # an old driver
+    assert cameras.captures(capability(0x84A00001, 0x04200001))
+    assert not cameras.captures(capability(0x84A00001, 0x04A00000))  # metadata
+    assert cameras.captures(capability(0x04000001, 0))  # an old driver

@@ -11,7 +11,7 @@ from benchmarks.instruments.camera_server import SIZE
 from benchmarks.instruments.sensor_peer import DARK, LIT, SensorPeer
 from sts_jax import hardware, storage
 from sts_jax.hardware import Action, Stage
-from sts_jax.hardware.settling import Settling
+from sts_jax.hardware.proof import Settling
 
 GUIDE = hardware.GuideConfig(empty_s=0.2, hold_s=0.2, rest_s=0.4)
 SETTLING = Settling(visual_s=0.1, tactile_s=0.1)

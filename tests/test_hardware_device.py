@@ -11,7 +11,7 @@ import pytest
 from benchmarks.instruments.camera_server import SIZE
 from benchmarks.instruments.sensor_peer import DARK, LIT, SensorPeer
 from sts_jax import hardware
-from sts_jax.hardware.settling import Settling, Switch, difference, settling, switched_share
+from sts_jax.hardware.proof import Settling, Switch, difference, settling, switched_share
 
 SETTLING = Settling(visual_s=0.1, tactile_s=0.1)
 

@@ -500,7 +500,7 @@ def test_two_processes_cannot_share_a_port(peer):
 
 def test_hardware_imports_no_jax():
     folder = Path(hardware.__file__).parent
-    for path in (folder / name for name in ("ports.py", "protocol.py", "emulation.py", "_connection.py", "leds.py")):
+    for path in (folder / name for name in ("protocol.py", "emulation.py", "leds.py")):
         assert not re.search(r"^\s*(import|from) (jax|sts_jax(?!\.hardware))", path.read_text(), re.MULTILINE), path
 
 

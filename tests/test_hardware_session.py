@@ -19,8 +19,8 @@ from session_writer import ORIGIN, pair
 
 from sts_jax import hardware, storage
 from sts_jax.hardware import recordings
+from sts_jax.hardware.proof import Settling
 from sts_jax.hardware.session import Session, SessionError
-from sts_jax.hardware.settling import Settling
 
 
 def add(session, *, confirm=True, final=True):

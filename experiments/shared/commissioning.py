@@ -82,7 +82,7 @@ def check(config: Config) -> None:
 
 
 @contextlib.contextmanager
-def opened(config: Config) -> Iterator[tuple[hardware.Camera, hardware.Leds]]:
+def opened(config: Config) -> Iterator[tuple[hardware.OpenCVCamera, hardware.Leds]]:
     """Open the camera and the LED controller, and close them after the `with` block. The lights are off at first."""
     assert config.camera is not None
     assert config.leds is not None
@@ -91,14 +91,14 @@ def opened(config: Config) -> Iterator[tuple[hardware.Camera, hardware.Leds]]:
     )
     with hardware.Leds.connect(config.leds) as leds:
         say(f"LED controller {leds.serial_number}: {leds.board}, firmware {leds.firmware}")
-        with hardware.Camera(dataclasses.replace(source, lock=source.kind == "device")) as camera:
+        with hardware.OpenCVCamera(dataclasses.replace(source, lock=source.kind == "device")) as camera:
             while camera.statistics.rate is None:
                 camera.async_read()
             say(f"camera {camera.source}: {config.width} x {config.height}, {camera.statistics.rate:.1f} frames/s")
             yield camera, leds
 
 
-def expose(config: Config, camera: hardware.Camera, leds: hardware.Leds) -> tuple[float, float] | None:
+def expose(config: Config, camera: hardware.OpenCVCamera, leds: hardware.Leds) -> tuple[float, float] | None:
     """Choose the exposure of each stream. The lights are off afterwards.
 
     Args:
@@ -121,10 +121,10 @@ def expose(config: Config, camera: hardware.Camera, leds: hardware.Leds) -> tupl
             chosen.append(exposure)
             words = f"{exposure:g} in the driver's unit"
         else:
-            time.sleep(hardware.exposure.LAG_S)
+            time.sleep(hardware.sts.LAG_S)
             seen = hardware.brightness(camera.read().image)
             words = "left to the server" if camera.config.kind == "stream" else "the driver does not let it be set"
-        if seen >= hardware.exposure.SATURATED:
+        if seen >= hardware.sts.SATURATED:
             words += f". The image is SATURATED: {'lower --levels' if stream == 'tactile' else 'darken the room'}"
             words += "" if settable else ", or lower the exposure at the camera"
         say(f"exposure of the {stream} stream: brightness {seen:.0f} of 255, {words}")
@@ -200,7 +200,7 @@ def live(config: Config, sensor: hardware.STS, pinhole: hardware.Pinhole) -> har
         ) from error
 
 
-def check_folder(config: Config, camera: hardware.Camera, leds: hardware.Leds) -> None:
+def check_folder(config: Config, camera: hardware.OpenCVCamera, leds: hardware.Leds) -> None:
     """Check that the folder does not contain the sensor file of other devices.
 
     Raises:
@@ -218,7 +218,7 @@ def check_folder(config: Config, camera: hardware.Camera, leds: hardware.Leds) -
         )
 
 
-def claim_pictures(config: Config, camera: hardware.Camera) -> None:
+def claim_pictures(config: Config, camera: hardware.OpenCVCamera) -> None:
     """Reserve the folder OUT/board for pictures from one camera, of one size and of one printed calibration board.
 
     Raises:

@@ -2,34 +2,35 @@
 
 from sts_jax.hardware.board import Board, FoundCorners, board_image, find_board, save_board
 from sts_jax.hardware.calibration import Calibration, CalibrationError, calibrate, fit_lens
-from sts_jax.hardware.camera import Camera
-from sts_jax.hardware.camera_config import CameraConfig
-from sts_jax.hardware.camera_errors import (
+from sts_jax.hardware.camera import (
     CameraBusyError,
+    CameraConfig,
     CameraError,
     CameraLostError,
     CameraNotConnectedError,
     CameraNotFoundError,
     CameraOpenError,
     CameraPermissionError,
+    CameraStatistics,
     CameraTimeoutError,
+    Captured,
     EndOfVideoError,
+    FoundCamera,
     FrameSizeError,
     FrozenCameraError,
     StaleFrameError,
+    find_cameras,
+    is_black,
 )
 from sts_jax.hardware.collecting import Action, AutomaticPerson, PairReader, Person, View, collect
 from sts_jax.hardware.coverage import check_view, covered, view_angle
-from sts_jax.hardware.devices import FoundCamera, find_cameras
-from sts_jax.hardware.exposure import Exposed, brightness, choose_exposure
-from sts_jax.hardware.frames import CameraStatistics, Captured, is_black
 from sts_jax.hardware.guide import EmptyPad, GuideConfig, Stage, known_pad
-from sts_jax.hardware.leds import Leds, Lit
-from sts_jax.hardware.lens import Lens, Pinhole, distorted, distortion, project, rectification, rectified
-from sts_jax.hardware.ports import (
+from sts_jax.hardware.leds import (
     DisconnectedError,
     LedError,
+    Leds,
     LedTimeoutError,
+    Lit,
     NotALedControllerError,
     Port,
     PortInUseError,
@@ -38,6 +39,9 @@ from sts_jax.hardware.ports import (
     WrongVersionError,
     find_controllers,
 )
+from sts_jax.hardware.lens import Lens, Pinhole, distorted, distortion, project, rectification, rectified
+from sts_jax.hardware.opencv import OpenCVCamera
+from sts_jax.hardware.proof import LightError, NoContrastError, NotStillError, Pair, Settling, Shot
 from sts_jax.hardware.recorder import Recorder
 from sts_jax.hardware.recordings import (
     Entry,
@@ -54,9 +58,7 @@ from sts_jax.hardware.recordings import (
 from sts_jax.hardware.replay import Replay
 from sts_jax.hardware.sensor_file import Background, Device, SensorFileError, WrongDeviceError
 from sts_jax.hardware.session import Origin, Session, SessionError
-from sts_jax.hardware.settling import NoContrastError, Settling
-from sts_jax.hardware.shots import LightError, NotStillError, Pair, Shot
-from sts_jax.hardware.sts import STS, FoundSensors, find_sensors
+from sts_jax.hardware.sts import STS, Exposed, FoundSensors, brightness, choose_exposure, find_sensors
 from sts_jax.hardware.views import RecordedImages, SensorView, recorded_images, relit, sensor_view
 
 __all__ = [
@@ -67,7 +69,6 @@ __all__ = [
     "Board",
     "Calibration",
     "CalibrationError",
-    "Camera",
     "CameraBusyError",
     "CameraConfig",
     "CameraError",
@@ -101,6 +102,7 @@ __all__ = [
     "NoContrastError",
     "NotALedControllerError",
     "NotStillError",
+    "OpenCVCamera",
     "Origin",
     "Pair",
     "PairReader",

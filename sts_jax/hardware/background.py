@@ -3,7 +3,7 @@
 import threading
 from collections.abc import Callable
 
-from sts_jax.hardware.shots import LightError, Pair
+from sts_jax.hardware.proof import LightError, Pair
 
 
 class Background:

@@ -10,11 +10,11 @@ import time
 from typing import Protocol, runtime_checkable
 
 from sts_jax.hardware import guide
-from sts_jax.hardware.camera_errors import CameraLostError, CameraTimeoutError, FrozenCameraError, StaleFrameError
+from sts_jax.hardware.camera import CameraLostError, CameraTimeoutError, FrozenCameraError, StaleFrameError
 from sts_jax.hardware.guide import EmptyPad, GuideConfig, Stage
-from sts_jax.hardware.ports import DisconnectedError, LedTimeoutError
+from sts_jax.hardware.leds import DisconnectedError, LedTimeoutError
+from sts_jax.hardware.proof import LightError, Pair
 from sts_jax.hardware.session import Session, SessionError
-from sts_jax.hardware.shots import LightError, Pair
 
 _PASSING = (
     CameraLostError,

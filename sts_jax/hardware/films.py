@@ -14,12 +14,11 @@ from jaxtyping import UInt8
 
 from sts_jax import storage
 from sts_jax.hardware import protocol
-from sts_jax.hardware.camera_config import CameraConfig
-from sts_jax.hardware.camera_errors import CameraOpenError
-from sts_jax.hardware.capture import Capture
+from sts_jax.hardware.camera import CameraConfig, CameraOpenError
 from sts_jax.hardware.leds import Lit
+from sts_jax.hardware.opencv import Capture
+from sts_jax.hardware.proof import Stream
 from sts_jax.hardware.recorder import FORMAT, FRAMES, HEAD, video_name
-from sts_jax.hardware.shots import Stream
 from sts_jax.storage import DamagedFileError
 
 _AGAIN = "copy the recording again"

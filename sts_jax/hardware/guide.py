@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from sts_jax.hardware.settling import thumbnail
+from sts_jax.hardware.proof import thumbnail
 
 Blocks = Float[np.ndarray, "24 32 3"]  # means of an image's blocks, 0 to 255
 SmallBlocks = Float[np.ndarray, "48 64 3"]  # means of blocks of half the width and height, 0 to 255

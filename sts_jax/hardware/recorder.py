@@ -28,11 +28,10 @@ import cv2
 
 from sts_jax import storage
 from sts_jax.hardware import matroska
+from sts_jax.hardware.proof import Settling, Shot
 from sts_jax.hardware.recordings import encoded
 from sts_jax.hardware.sensor_file import Device, sensor_file
 from sts_jax.hardware.session import Origin
-from sts_jax.hardware.settling import Settling
-from sts_jax.hardware.shots import Shot
 
 FORMAT = 1  # version of the format of a recording. Incremented when older files can no longer be read
 HEAD, FRAMES = "recording.json", "frames.jsonl"

@@ -31,8 +31,7 @@ from jaxtyping import UInt8
 from sts_jax import storage
 from sts_jax.hardware.guide import End
 from sts_jax.hardware.leds import Lit
-from sts_jax.hardware.settling import Settling
-from sts_jax.hardware.shots import Pair, Shot, Stream
+from sts_jax.hardware.proof import Pair, Settling, Shot, Stream
 from sts_jax.storage import DamagedFileError
 
 FORMAT = 1  # version of the format of a session. Incremented when older files can no longer be read

@@ -9,11 +9,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
 
-from sts_jax.hardware.camera_errors import CameraError, CameraNotConnectedError, EndOfVideoError, StaleFrameError
+from sts_jax.hardware.camera import CameraError, CameraNotConnectedError, EndOfVideoError, StaleFrameError
 from sts_jax.hardware.films import Film, RecordedFilm, Still, VideoFilm
 from sts_jax.hardware.leds import Lit
+from sts_jax.hardware.proof import LightError, Pair, Shot, Stream
 from sts_jax.hardware.sensor_file import Device, sensor_file
-from sts_jax.hardware.shots import LightError, Pair, Shot, Stream
 from sts_jax.hardware.sts import first_still, stream_order
 
 # Largest delay at which `stream` still returns an image (s). The buffer of a real sensor's camera holds 8 frames, which

@@ -20,7 +20,7 @@ from PIL import Image
 
 from sts_jax import storage
 from sts_jax.hardware import protocol
-from sts_jax.hardware.camera_config import CameraConfig
+from sts_jax.hardware.camera import CameraConfig
 from sts_jax.hardware.lens import Lens
 
 VERSION = 1  # version of the format of the JSON object "device"

@@ -11,11 +11,10 @@ from pathlib import Path
 from types import TracebackType
 
 from sts_jax import storage
-from sts_jax.hardware import devices, protocol, recordings
-from sts_jax.hardware.camera_config import CameraConfig
+from sts_jax.hardware import protocol, recordings
+from sts_jax.hardware.camera import CameraConfig, device_path, stable_path
 from sts_jax.hardware.guide import End
-from sts_jax.hardware.settling import Settling
-from sts_jax.hardware.shots import Pair
+from sts_jax.hardware.proof import Pair, Settling
 from sts_jax.hardware.sts import STS
 
 _JOBS_OF_TRAJECTORY = 3  # two pairs and the confirmation
@@ -61,7 +60,7 @@ def _name(config: CameraConfig) -> str:
         url = urllib.parse.urlsplit(str(config.source))
         return urllib.parse.urlunsplit((url.scheme, url.hostname or "", url.path, url.query, ""))
     if config.kind == "device":
-        return str(devices.stable_path(devices.device_path(config.target)))
+        return str(stable_path(device_path(config.target)))
     return config.name
 
 

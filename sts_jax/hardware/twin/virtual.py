@@ -4,9 +4,8 @@ import numpy as np
 
 from sts_jax.hardware import protocol
 from sts_jax.hardware.leds import Lit
+from sts_jax.hardware.proof import LightError, Pair, Settling, Shot, Stream, Switch, settling, thumbnail
 from sts_jax.hardware.session import Origin
-from sts_jax.hardware.settling import Settling, Switch, settling, thumbnail
-from sts_jax.hardware.shots import LightError, Pair, Shot, Stream
 from sts_jax.hardware.sts import checked_levels
 from sts_jax.hardware.twin.device import Twin
 
