@@ -2,6 +2,7 @@
 
 import dataclasses
 import inspect
+import itertools
 import json
 import shutil
 
@@ -68,7 +69,7 @@ def test_trajectories_do_not_depend_on_the_number_of_rendered_ones(folder, spars
         np.testing.assert_array_equal(data.members(part, rendered=False), whole.members(part))
     for one, other in zip(data.pairs(np.array([4])), whole.pairs(np.array([4])), strict=True):
         np.testing.assert_array_equal(one, other)
-    with pytest.raises(ValueError, match=r"`trajectories` contains 3, which has no images: .* images for 1 of its"):
+    with pytest.raises(ValueError, match=r"`trajectories` contains 3, which has no images: use `ends`"):
         data.pairs(np.array([2, 3]))
     rows = evaluation.rows_of(data, "trajectory")
     np.testing.assert_array_equal(np.sort(np.concatenate([rows["train"], rows["test"]])), data.rendered())
@@ -123,12 +124,6 @@ def test_views_are_drawn_by_sense_at_starts_of_no_trajectory(sparse):
 def test_a_collection_without_views_has_none(folder):
     views = dataset.load(folder).views("train")
     assert [leaf.shape for leaf in views] == [(0, 64, 64, 3), (0, 7), (0, 128), (0,), (0, 3), (0,)]
-    with pytest.raises(ValueError, match="unknown part 'all'"):
-        dataset.load(folder).views("all")
-
-
-def test_the_sensor_of_a_dataset_can_be_loaded(folder):
-    assert sts.Sensor.load(folder / "sensor.json").constants() == sts.Sensor().constants()
 
 
 def test_full_trajectories_have_all_frames_and_others_two(folder):
@@ -136,28 +131,42 @@ def test_full_trajectories_have_all_frames_and_others_two(folder):
     np.testing.assert_array_equal(data.full_trajectories(), [0])
     assert data.strip(0).visual.shape == (12, 64, 64, 3)
     assert len(data.frames) == 12 + 7 * 2 + 8 * 14
+    assert sts.Sensor.load(folder / "sensor.json").constants() == sts.Sensor().constants()
 
 
-def test_a_resumed_collection_has_the_same_bytes(folder, tmp_path):
-    names = sorted(path.name for path in folder.iterdir())
-    for name in names:  # a kill after the first shard, with a half-written second one
-        if "00001-of" not in name:
-            (tmp_path / name).write_bytes((folder / name).read_bytes())
-    second = next(name for name in names if name.startswith("shard-00001") and name.endswith("array_record"))
-    (tmp_path / second).write_bytes((folder / second).read_bytes()[:1000])
+SHARDS = ("shard-00000-of-00002", "shard-00001-of-00002")
+
+
+def bytes_of(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize("killed", ["while images are written", "before the manifest is written"])
+def test_a_resumed_collection_has_the_same_bytes(folder, tmp_path, killed, monkeypatch):
+    out = tmp_path / "dataset"
+
+    def kill(*args):
+        raise KeyboardInterrupt
+
+    name = "write_images" if killed == "while images are written" else "write_arrays"
+    module = dataset.collecting if name == "write_arrays" else dataset.records
+    write, calls = getattr(module, name), itertools.count()
+    monkeypatch.setattr(module, name, lambda *args: write(*args) if next(calls) == 0 else kill())
+    with pytest.raises(KeyboardInterrupt):
+        dataset.collect(SMALL, sts.Sensor(), out)
+    monkeypatch.undo()
+    (out / f"{SHARDS[1]}.array_record").write_bytes(b"half")  # neither file of this shard is in the manifest
     with pytest.raises(FileNotFoundError, match="not finished"):
-        dataset.load(tmp_path)
-    before = (tmp_path / "shard-00000-of-00002.npz").stat().st_mtime_ns
+        dataset.load(out)
+    before = (out / f"{SHARDS[0]}.npz").stat().st_mtime_ns
     seen = []
-    dataset.collect(SMALL, sts.Sensor(), tmp_path, progress=seen.append)
-    assert sorted(path.name for path in tmp_path.iterdir()) == names
-    for name in names:
-        assert (tmp_path / name).read_bytes() == (folder / name).read_bytes(), name
-    assert (tmp_path / "shard-00000-of-00002.npz").stat().st_mtime_ns == before
+    dataset.collect(SMALL, sts.Sensor(), out, progress=seen.append)
+    assert bytes_of(out) == bytes_of(folder)
+    assert (out / f"{SHARDS[0]}.npz").stat().st_mtime_ns == before
     assert seen[-1].done == seen[-1].total
-    stamps = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
-    dataset.collect(SMALL, sts.Sensor(), tmp_path)
-    assert stamps == {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    stamps = {path: path.stat().st_mtime_ns for path in out.iterdir()}
+    dataset.collect(SMALL, sts.Sensor(), out)
+    assert stamps == {path: path.stat().st_mtime_ns for path in out.iterdir()}
 
 
 @pytest.mark.slow
@@ -177,9 +186,6 @@ def test_another_collection_in_the_same_folder_is_refused(folder):
         dataset.collect(other, sts.Sensor(), folder)
 
 
-SHARDS = ("shard-00000-of-00002", "shard-00001-of-00002")
-
-
 @pytest.fixture
 def copied(folder, tmp_path):
     """A dataset that may be damaged."""
@@ -193,139 +199,121 @@ def swap(one, other):
     between.rename(other)
 
 
-@pytest.mark.parametrize(
-    ("endings", "message"),
-    [
-        ((".array_record",), r"00000-of-00002\.array_record is damaged or belongs to another shard"),
-        ((".npz",), r"00000-of-00002\.npz contains the data of shard 1 instead of shard 0"),
-        ((".array_record", ".npz"), r"00000-of-00002\.npz contains the data of shard 1 instead of shard 0"),
-    ],
-)
-def test_swapped_shards_are_refused(copied, endings, message):
-    for ending in endings:
-        swap(*(copied / f"{name}{ending}" for name in SHARDS))
-    with pytest.raises(storage.DamagedFileError, match=message):
-        dataset.load(copied)
-    with pytest.raises(storage.DamagedFileError, match=message):
-        dataset.collect(SMALL, sts.Sensor(), copied)
+def swap_shards(*endings):
+    return lambda at: [swap(*(at / f"{name}{ending}" for name in SHARDS)) for ending in endings]
 
 
-def test_images_copied_over_others_and_a_flipped_bit_are_refused(copied):
-    one, other = (copied / f"{name}.array_record" for name in SHARDS)
-    whole = one.read_bytes()
-    one.write_bytes(other.read_bytes())
-    with pytest.raises(storage.DamagedFileError, match=r"00000.*is damaged or belongs to another shard"):
-        dataset.load(copied)
-    flipped = bytearray(whole)
-    flipped[len(whole) // 2] ^= 4
-    one.write_bytes(flipped)
-    with pytest.raises(storage.DamagedFileError, match=r"00000.*is damaged or belongs to another shard"):
-        dataset.load(copied)
-    one.write_bytes(whole)
-    assert dataset.load(copied).identity
+def flip(name, place):
+    def change(at):
+        data = bytearray((at / name).read_bytes())
+        data[int(place * len(data))] ^= 4
+        (at / name).write_bytes(data)
+
+    return change
+
+
+def truncate(name):
+    return lambda at: (at / name).write_bytes((at / name).read_bytes()[:-1000])
+
+
+def edit(name, field, value):
+    def change(at):
+        content = json.loads((at / name).read_text())
+        (at / name).write_text(json.dumps({**content, field: value}, indent=2) + "\n")
+
+    return change
+
+
+EDITED = r" is not the file that manifest\.json lists .*delete it \(of a shard both files\) and collect"
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("damage", "message"),
     [
+        (swap_shards(".array_record"), r"00000-of-00002\.array_record" + EDITED),
+        (swap_shards(".npz"), r"00000-of-00002\.npz" + EDITED),
+        (swap_shards(".array_record", ".npz"), r"00000-of-00002\.array_record" + EDITED),
+        (flip(f"{SHARDS[1]}.npz", 0.5), r"00001-of-00002\.npz" + EDITED),
+        (flip(f"{SHARDS[1]}.npz", 0.999), r"00001-of-00002\.npz" + EDITED),
+        (flip(f"{SHARDS[0]}.array_record", 0.5), r"00000-of-00002\.array_record" + EDITED),
+        (truncate(f"{SHARDS[1]}.array_record"), r"00001-of-00002\.array_record" + EDITED),
+        (lambda at: (at / f"{SHARDS[0]}.array_record").unlink(), r"00000-of-00002\.array_record is missing"),
+        (lambda at: (at / f"{SHARDS[0]}.npz").unlink(), r"00000-of-00002\.npz is missing"),
+        (edit("split.json", "test", [3, 1]), r"split\.json" + EDITED),
+        (flip("sensor.json", 0.5), r"sensor\.json (is not the file|was made with|cannot be read)"),
         (
-            lambda split: split["test"].append(split["train"][0]),
-            "object . must be in exactly one of train, validation, test, but it occurs 2 times",
+            flip("manifest.json", 0.5),
+            r"manifest\.json (is damaged|cannot be read).*: restore it, or collect into anoth",
         ),
-        (lambda split: split["train"].pop(), "in exactly one of train, validation, test, but it occurs 0 times"),
-        (lambda split: split["test"].append(4), "test contains object 4, but the objects are 0 to 3"),
-        (lambda split: split["test"].append(-1), "test contains object -1"),
-        (lambda split: split["test"].append(1.5), "test must be a list of whole numbers"),
-        (lambda split: split.pop("validation"), "must have the parts train, validation, test, got 'train', 'test'"),
-        (lambda split: split.update(other=[]), "must have the parts train, validation, test, got .*'other'"),
+        (edit("manifest.json", "facts", {"shards": 1}), r"manifest\.json is damaged"),
+        (lambda at: (at / "manifest.json").unlink(), r"manifest\.json is missing, but .* has shards: restore it, or"),
+        (lambda at: (at / "collection.json").write_bytes(b"\xff"), r"collection\.json cannot be read as JSON"),
     ],
 )
-def test_an_invalid_split_is_refused(copied, change, message):
-    path = copied / "split.json"
-    split = json.loads(path.read_text())
-    change(split)
-    path.write_text(json.dumps(split))
+def test_damage_is_named_and_nothing_is_overwritten(copied, damage, message):
+    damage(copied)
+    before = bytes_of(copied)
     for use in (dataset.load, lambda folder: dataset.collect(SMALL, sts.Sensor(), folder)):
-        with pytest.raises(storage.DamagedFileError, match=rf"split\.json.*{message}"):
+        with pytest.raises((storage.DamagedFileError, ValueError), match=message):
             use(copied)
+    assert bytes_of(copied) == before
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("sensor.json", None, r"sensor\.json is missing"),
-        ("sensor.json", b'{"gel"', r"sensor\.json cannot be read as JSON"),
-        ("sensor.json", b"{}", r"npz was made with a sensor\.json that differs"),
-        ("split.json", b"\xff", r"split\.json cannot be read as JSON .*delete .*split\.json and start the collection"),
-        ("split.json", b"7", r"split\.json must have the parts train, validation, test, got a int"),
-        ("collection.json", None, r"collection\.json is missing: .* is not a collected dataset"),
-        ("collection.json", b"\xff", r"collection\.json cannot be read as JSON"),
-        ("collection.json", b"[]", r"collection\.json does not describe a dataset"),
-        (
-            "collection.json",
-            b'{"format": 4}',
-            r"collection\.json: num_objects must be a whole number of at least 1, got N",
-        ),
-    ],
-)
-def test_a_damaged_or_exchanged_description_is_named(copied, name, content, message):
+@pytest.mark.parametrize("name", ["sensor.json", "collection.json"])
+def test_an_edited_or_missing_description_is_named(copied, name):
+    edit(name, "resolution", [32, 64])(copied)
+    with pytest.raises(storage.DamagedFileError, match=f"{name}{EDITED}"):
+        dataset.load(copied)
     (copied / name).unlink()
-    if content is not None:
-        (copied / name).write_bytes(content)
-    with pytest.raises(OSError, match=message):
+    with pytest.raises(storage.DamagedFileError, match=f"{name} is missing"):
         dataset.load(copied)
 
 
-def test_a_description_that_was_changed_afterwards_is_named(copied):
-    path = copied / "collection.json"
-    content = json.loads(path.read_text())
-    path.write_text(json.dumps(content, indent=7))  # the layout does not matter
-    assert dataset.load(copied).collection == content
-    path.write_text(json.dumps({**content, "resolution": [32, 64]}))
-    with pytest.raises(storage.DamagedFileError, match=r"was made with a collection\.json that differs"):
-        dataset.load(copied)
+def test_files_deleted_as_the_message_says_are_made_again_with_the_same_bytes(folder, copied):
+    for name in (f"{SHARDS[0]}.npz", f"{SHARDS[0]}.array_record", "split.json", "sensor.json", "collection.json"):
+        (copied / name).unlink()
+    dataset.collect(SMALL, sts.Sensor(), copied)
+    assert bytes_of(copied) == bytes_of(folder)
 
 
-@pytest.mark.parametrize("older", [1, 3])
-def test_an_older_dataset_must_be_collected_again(copied, older):
-    path = copied / "collection.json"
-    content = json.loads(path.read_text())
-    del content["format"]
-    path.write_text(json.dumps(content if older == 1 else {**content, "format": older}))
+@pytest.mark.parametrize("older", [1, 4, "x"])
+def test_a_dataset_of_another_format_is_refused_and_kept(copied, older):
+    (copied / "manifest.json").unlink()
+    edit("collection.json", "format", older)(copied)
+    before = bytes_of(copied)
     for use in (dataset.load, lambda folder: dataset.collect(SMALL, sts.Sensor(), folder)):
         with pytest.raises(
-            ValueError,
-            match=rf"is a dataset of format {older}, but this version of sts_jax reads format 4: delete .* and",
+            ValueError, match=rf"is a dataset of format {older!r}, .* reads format 5: collect into another"
         ):
             use(copied)
+    assert bytes_of(copied) == before
 
 
-@pytest.mark.parametrize("given", [[99], [-1], [0.5], [True, False], 0, "a"])
-def test_trajectories_that_do_not_exist_are_named(folder, given):
-    with pytest.raises(ValueError, match=r"`trajectories` (has the type|contains)"):
-        inspect.unwrap(type(dataset.load(folder)).pairs)(dataset.load(folder), given)
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda at: dataset.load(at).pairs([99]), ValueError, r"`trajectories` contains 99, .*trajectories 0 to 7"),
+        (lambda at: dataset.load(at).pairs([-1]), ValueError, r"`trajectories` contains -1"),
+        (lambda at: dataset.load(at).pairs([0.5]), ValueError, r"`trajectories` has the type float64"),
+        (lambda at: dataset.load(at).pairs([True, False]), ValueError, r"has the type bool.* np\.flatnonzero\(mask\)"),
+        (lambda at: dataset.load(at).pairs(0), ValueError, r"`trajectories` has the type int64 and the shape \(\)"),
+        (lambda at: dataset.load(at).views("all"), ValueError, "unknown part 'all'"),
+        (lambda at: dataset.load(at / "collection.json"), NotADirectoryError, r"is a file: give the folder"),
+        (lambda at: dataset.load(at / "no"), FileNotFoundError, r"no is not a collected dataset"),
+    ],
+)
+def test_a_wrong_use_is_named(folder, call, error, message, monkeypatch):
+    for name in ("pairs", "views"):  # without the annotations' check, which tests have and users do not
+        monkeypatch.setattr(dataset.Dataset, name, inspect.unwrap(getattr(dataset.Dataset, name)))
+    with pytest.raises(error, match=message):
+        call(folder)
 
 
-def test_a_file_in_the_place_of_a_dataset_is_named(folder):
-    with pytest.raises(NotADirectoryError, match=r"collection\.json is a file: give the folder"):
-        dataset.load(folder / "collection.json")
-
-
-def test_the_identity_of_a_dataset_follows_from_its_files(folder, copied):
-    assert dataset.load(copied).identity == dataset.load(folder).identity
-    path = copied / "split.json"
-    split = json.loads(path.read_text())
-    path.write_text(json.dumps({**split, "train": split["test"], "test": split["train"]}))
-    assert dataset.load(copied).identity != dataset.load(folder).identity
-
-
-def test_the_split_of_an_existing_dataset_is_kept(copied):
-    path = copied / "split.json"
-    split = json.loads(path.read_text())
-    other = {**split, "train": split["test"], "test": split["train"]}
-    path.write_text(json.dumps(other))
+def test_the_identity_of_a_dataset_follows_from_its_files(folder, sparse, copied):
+    identity = dataset.load(folder).identity
+    assert dataset.load(copied).identity == identity != dataset.load(sparse).identity
     dataset.collect(SMALL, sts.Sensor(), copied)
-    assert json.loads(path.read_text()) == other
+    assert dataset.load(copied).identity == identity
 
 
 def test_a_folder_that_another_process_collects_into_is_refused(copied):

@@ -1,11 +1,12 @@
-"""Shards are read as they were written, torn files are named, and a full disk loses nothing."""
+"""Images are read as they were written, a torn file is named, a full disk loses nothing, and reduced images."""
 
 import resource
 
+import cv2
 import numpy as np
 import pytest
 
-from sts_jax import storage
+from sts_jax import dataset, storage
 from sts_jax.dataset import records
 
 
@@ -34,7 +35,7 @@ def test_views_after_frames_are_read_in_the_given_order(tmp_path):
     records.write_images(path, [images, (views,)])
     back = records.read_views(path, np.array([7, 5]), resolution=(9, 7), total=8)
     np.testing.assert_array_equal(back, views[[2, 0]])
-    with pytest.raises(storage.DamagedFileError, match=r"number of records is 8 instead of 5"):
+    with pytest.raises(storage.DamagedFileError, match=r"it has 8 records instead of 5"):
         records.read_images(path, np.arange(5), resolution=(9, 7), total=5)
 
 
@@ -58,11 +59,6 @@ def test_a_truncated_file_is_named(tmp_path, keep):
     arrays.write_bytes(arrays.read_bytes()[: int(keep * arrays.stat().st_size)])
     with pytest.raises(storage.DamagedFileError, match=r"a\.npz is damaged .*: delete it\."):
         storage.read_arrays(arrays, "delete it")
-
-
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"b\.array_record"):
-        records.read_images(tmp_path / "b.array_record", np.arange(1), resolution=(9, 7), total=1)
 
 
 def test_an_interruption_while_writing_leaves_no_file(tmp_path):
@@ -104,84 +100,33 @@ def test_an_error_while_rendering_is_not_reported_as_a_full_disk(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-COLLECTION, SENSOR = "c" * 64, "s" * 64
+@pytest.mark.parametrize("factor", [1, 2, 3, 16])
+def test_pixels_are_the_rounded_means_of_blocks(factor):
+    images = np.random.default_rng(factor).integers(0, 256, (2, 3, 4 * factor, 4 * factor, 3), dtype=np.uint8)
+    images[0, 0] = 255  # the largest sum of a block
+
+    small = dataset.reduced_images({"visual": images}, 4)["visual"]
+
+    exact = np.array(
+        [[cv2.resize(x.astype(np.float64), (4, 4), interpolation=cv2.INTER_AREA) for x in y] for y in images]
+    )
+    assert small.dtype == np.uint8
+    assert small.shape == exact.shape
+    assert np.abs(small - exact).max() <= 0.5 + 1e-9
 
 
-def shard(folder, index, seed=0, collection=COLLECTION):
-    """A shard's record file, written with five images, two views and arrays that hold nothing."""
-    path = folder / f"{index}.array_record"
-    images = some_images()._replace(visual=np.random.default_rng(seed).integers(0, 256, (5, 9, 7, 3), dtype=np.uint8))
-    arrays = {name: np.arange(3) for name in records.ARRAYS}
-    records.write_shard(path, [images, (images.visual[:2],)], arrays, records.Identity(collection, SENSOR, index))
-    return path
+def test_a_bool_pixel_is_true_if_at_least_half_of_its_block_is_true():
+    blocks = np.array([[[0, 0], [0, 0]], [[1, 0], [0, 0]], [[0, 1], [1, 0]], [[1, 1], [0, 1]]], bool)
+
+    small = dataset.reduced_images({"segmentation": blocks[..., None]}, 1)["segmentation"]
+
+    assert small.dtype == bool
+    assert small.ravel().tolist() == [False, False, True, True]
 
 
-def test_a_shard_is_read_as_it_was_written(tmp_path):
-    arrays = records.read_shard(shard(tmp_path, 0), records.Identity(COLLECTION, SENSOR, 0))
-    assert set(arrays) == records.ARRAYS
-    np.testing.assert_array_equal(arrays["frames"], np.arange(3))
-
-
-def test_images_of_another_shard_are_refused(tmp_path):
-    one, other = shard(tmp_path, 0, seed=1), shard(tmp_path, 1, seed=2)
-    assert one.stat().st_size == other.stat().st_size  # both hold noise of equal length
-    one.write_bytes(other.read_bytes())
-    with pytest.raises(storage.DamagedFileError, match=r"0\.array_record is damaged or belongs to another shard"):
-        records.read_shard(one, records.Identity(COLLECTION, SENSOR, 0))
-    assert records.read_shard(other, records.Identity(COLLECTION, SENSOR, 1))
-
-
-def test_both_files_of_another_shard_are_refused(tmp_path):
-    one, other = shard(tmp_path, 0), shard(tmp_path, 1)
-    for ending in (".array_record", ".npz"):
-        one.with_suffix(ending).write_bytes(other.with_suffix(ending).read_bytes())
+@pytest.mark.parametrize(("shape", "size"), [((6, 6, 3), 4), ((4, 6, 3), 2), ((4, 4, 3), 0)])
+def test_a_size_that_does_not_divide_square_images_is_refused(shape, size):
     with pytest.raises(
-        storage.DamagedFileError, match=r"0\.npz contains the data of shard 1 instead of shard 0: delete 0\.npz and"
+        ValueError, match=f"size is {size}, but the images are {shape[0]} x {shape[1]} pixels: .*multiple"
     ):
-        records.read_shard(one, records.Identity(COLLECTION, SENSOR, 0))
-
-
-@pytest.mark.parametrize("changed", ["collection", "sensor"])
-def test_a_shard_of_another_collection_or_sensor_is_refused(tmp_path, changed):
-    wanted = records.Identity(COLLECTION, SENSOR, 0)._replace(**{changed: "f" * 64})
-    with pytest.raises(storage.DamagedFileError, match=rf"0\.npz was made with a {changed}\.json that differs"):
-        records.read_shard(shard(tmp_path, 0), wanted)
-
-
-def test_a_flipped_bit_is_found_or_changes_no_array(tmp_path):
-    path, identity = shard(tmp_path, 0), records.Identity(COLLECTION, SENSOR, 0)
-    before = records.read_shard(path, identity)
-    rng = np.random.default_rng(0)
-    for ending in (".array_record", ".npz"):
-        file = path.with_suffix(ending)
-        whole = file.read_bytes()
-        unnoticed = 0
-        for bit in rng.integers(0, 8 * len(whole), 200):
-            torn = bytearray(whole)
-            torn[bit // 8] ^= 1 << bit % 8
-            file.write_bytes(torn)
-            try:
-                after = records.read_shard(path, identity)
-            except storage.DamagedFileError:
-                continue
-            unnoticed += 1  # dates and the like in a zip's directory
-            assert all(np.array_equal(after[name], before[name]) for name in records.ARRAYS)
-            assert ending == ".npz"
-        assert unnoticed < 100
-        file.write_bytes(whole)
-
-
-def test_a_missing_array_is_named(tmp_path):
-    path = shard(tmp_path, 0)
-    arrays = storage.read_arrays(path.with_suffix(".npz"), "delete it")
-    del arrays["trajectory/pose"]
-    storage.write_arrays(path.with_suffix(".npz"), arrays)
-    with pytest.raises(storage.DamagedFileError, match=r"0\.npz lacks the arrays trajectory/pose: delete"):
-        records.read_shard(path, records.Identity(COLLECTION, SENSOR, 0))
-
-
-def test_a_missing_record_file_is_named(tmp_path):
-    path = shard(tmp_path, 0)
-    path.unlink()
-    with pytest.raises(FileNotFoundError, match=r"0\.array_record is missing: delete 0\.npz and collect again"):
-        records.read_shard(path, records.Identity(COLLECTION, SENSOR, 0))
+        dataset.reduced_images({"visual": np.zeros(shape, np.uint8)}, size)

@@ -1,7 +1,6 @@
 """`collect` makes the objects of a dataset, simulates the trajectories and renders the frames.
 
-A dataset consists of shards. A shard is a pair of files for some of the objects. The content of a shard is a pure
-function of the `Collection`, the sensor and the index of the shard, so a missing shard can be made again at any time.
+A shard is a pure function of the `Collection`, the sensor and its index, so a missing shard can be made again.
 """
 
 import dataclasses
@@ -24,10 +23,9 @@ from sts_jax.dataset.collection import (
     split_objects,
     symmetries_of,
 )
-from sts_jax.dataset.loading import read_split
 from sts_jax.dataset.rendering import render
 from sts_jax.sensor import Sensor
-from sts_jax.storage import claim, digest, lock, read_json, write_json
+from sts_jax.storage import checksums, claim, lock, read_arrays, verify, write_arrays, write_json, write_manifest
 
 
 class Collected(NamedTuple):
@@ -38,11 +36,7 @@ class Collected(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """Progress of `collect`, which alternates between two stages: simulation and rendering.
-
-    A shard is a pair of files with the data of some of the objects. `collect` first simulates the objects of a shard,
-    then renders their images, and then continues with the next shard.
-    """
+    """Progress of `collect`, which simulates the objects of a shard, then renders them, then goes to the next shard."""
 
     done: int  # finished trajectories of the dataset, or finished frames and views of the current shard
     total: int  # all trajectories of the dataset, or all frames and views of the current shard
@@ -56,34 +50,20 @@ def collect(
     *,
     progress: Callable[[Progress], None] | None = None,
 ) -> Collected:
-    """Simulate and render a dataset, and write it to a folder.
+    """Simulate and render a dataset into a folder. A repeated call makes only the shards that the folder lacks.
 
-    The dataset is written as shards. A shard is a pair of files with the data of some of the objects. The function
-    makes only the shards that the folder lacks, so a repeated call resumes an interrupted collection.
-
-    If a trajectory becomes non-finite or the object sinks too deep into the pad, the trajectory is discarded and
-    sampled again. An object that cannot be made or cannot be simulated is left out.
+    A trajectory that becomes non-finite, or whose object sinks too deep into the pad, is discarded and sampled again.
+    An object that cannot be made or simulated is left out.
 
     Args:
         collection: The description of the dataset.
         sensor: The sensor for the simulation and the images.
-        folder: The folder of the dataset, created if it is missing. It receives the shards, `collection.json`,
-            `sensor.json` (for `Sensor.load`) and `split.json`.
-        progress: Function that is called with a `Progress` when some trajectories or images are finished.
+        folder: The folder of the dataset. It receives the shards, `collection.json`, `sensor.json` (for
+            `Sensor.load`), `split.json` and `manifest.json`.
+        progress: Called when some trajectories or images are finished.
 
     Returns:
         Summary of the whole dataset, including the shards that earlier calls made.
-
-    Raises:
-        ValueError: A constant of the sensor or a field of the collection is out of range, the pad is not square but the
-            symmetries of the collection need a square pad, or no object of a shard can be simulated. The error is also
-            raised if `collection.json` or `sensor.json` in the folder is from another collection, sensor or format. The
-            message names the constant, the field or the file.
-        ImportError: `collection.parts` or a mesh file needs a package that is not installed.
-        LockedError: Another process collects into the folder.
-        DamagedFileError: A file in the folder is damaged, or a file of a shard belongs to another dataset or shard. The
-            message names the file.
-        OSError: The disk is full, or the folder cannot be written to.
     """
     sensor.check()
     collection.check(sensor)
@@ -95,55 +75,57 @@ def _collect(
     collection: Collection, sensor: Sensor, folder: Path, progress: Callable[[Progress], None] | None
 ) -> Collected:
     """Do the work of `collect` in a folder that this process has locked."""
-    description, constants, path = as_json(collection), sensor.constants(), folder / "collection.json"
-    if path.exists():
-        records.check_format(read_json(path, f"delete {folder} and collect again"), folder)
-    claim(path, description)
-    claim(folder / "sensor.json", constants)
-    split = folder / "split.json"
-    if split.exists():  # a split that an older version of this library made is kept
-        read_split(split, collection.num_objects)
-    else:
-        write_json(split, {name: [int(i) for i in part] for name, part in split_objects(collection).items()})
-    made = Collected(0, ())
+    manifest = records.manifest_of(folder)
+    claim(folder / "collection.json", as_json(collection))
+    claim(folder / "sensor.json", sensor.constants())
+    if not (folder / "split.json").exists():
+        split = {name: [int(i) for i in part] for name, part in split_objects(collection).items()}
+        write_json(folder / "split.json", split)
+    if manifest is None:
+        facts = {"shards": collection.num_shards}
+        manifest = write_manifest(folder, checksums(folder, records.DESCRIPTIONS), facts)
+    verify(folder, manifest, records.remedy(folder), records.DESCRIPTIONS)
+    resampled, left_out = 0, []
     for index in range(collection.num_shards):
-        identity = records.Identity(digest(description), digest(constants), index)
-        path = records.shard_path(folder, collection.num_shards, index)
-        if not path.with_suffix(".npz").exists():
-            _make_shard(collection, sensor, folder, identity, progress)
-        shard = records.read_shard(path, identity)
-        resampled = made.resampled + int(shard["trajectory/resampled"].sum())
-        made = Collected(resampled, made.left_out + tuple(shard["left_out"].tolist()))
-    return made
+        files = records.shard_files(index, collection.num_shards)
+        if not all(name in manifest.files for name in files) or not any((folder / name).exists() for name in files):
+            _make_shard(collection, sensor, folder, index, progress)
+            manifest = write_manifest(folder, manifest.files | checksums(folder, files), manifest.facts)
+        verify(folder, manifest, records.remedy(folder), files)
+        arrays = read_arrays(folder / files[1], records.remedy(folder))
+        resampled += int(arrays["trajectory/resampled"].sum())
+        left_out += arrays["left_out"].tolist()
+    return Collected(resampled, tuple(left_out))
 
 
 def _make_shard(
     collection: Collection,
     sensor: Sensor,
     folder: Path,
-    identity: records.Identity,
+    index: int,
     progress: Callable[[Progress], None] | None,
 ) -> None:
-    """Simulate, render and write one shard. Its index is `identity.shard`."""
-    index, first = identity.shard, identity.shard * collection.objects_per_shard
+    """Simulate, render and write one shard."""
+    first = index * collection.objects_per_shard
     members = np.arange(first, min(first + collection.objects_per_shard, collection.num_objects))
     key = jax.random.fold_in(jax.random.key(collection.seed), collection.num_objects + index)
-    found, left_out = _made(collection, members)
+    made, left_out = _made(collection, members)
     report = _report(progress, first * collection.num_per_object, collection.num_trajectories, "trajectories")
-    found, trajectory, failed = _simulated(collection, sensor, key, found, report)
+    simulated, trajectory, failed = _simulated(collection, sensor, key, made, report)
     left_out += failed
     if trajectory is None:
         raise ValueError(
             f"{folder}: no object of shard {index} can be simulated (first object: {members[0]}, number of objects: "
             f'{len(members)}): use other objects or another scenario. One of the errors is "{left_out[-1]}"'
         )
-    members, bodies = np.array(list(found)), list(found.values())
+    members, bodies = np.array(list(simulated)), list(simulated.values())
     frames = _frames_of(collection, members, trajectory)
     views = _views_of(collection, key, bodies, sensor)
     arrays = _arrays(members, bodies, trajectory, views) | {"frames": frames, "left_out": np.array(left_out, str)}
     report = _report(progress, 0, len(frames) + len(views["body"]), "frames")
-    images = render(collection, sensor, bodies, trajectory, frames, views, report)
-    records.write_shard(records.shard_path(folder, collection.num_shards, index), images, arrays, identity)
+    images, table = records.shard_files(index, collection.num_shards)
+    records.write_images(folder / images, render(collection, sensor, bodies, trajectory, frames, views, report))
+    write_arrays(folder / table, arrays)
 
 
 def _simulated(

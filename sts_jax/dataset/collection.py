@@ -16,11 +16,9 @@ PARTS = ("train", "validation", "test")  # the parts into which the objects are 
 
 @dataclasses.dataclass(frozen=True)
 class Collection:
-    """Description of a dataset: its scenario, objects, trajectories, images, split and seed.
+    """Description of a dataset. Together with a `Sensor`, it determines every byte of the dataset.
 
-    A collection and a `Sensor` determine every byte of the dataset, as long as the code of the scenario and of the
-    object classes stays the same. The description contains the names of the scenario and of the object classes, but not
-    their code. If you change the code of your own scenario or object class, the same collection gives another dataset.
+    The description has the names of your own scenario and object classes, but not their code.
     """
 
     scenario: physics.Scenario = dataclasses.field(default_factory=physics.Freefall)
@@ -55,36 +53,22 @@ class Collection:
 
     @property
     def num_shards(self) -> int:
-        """Number of shards. A shard is a pair of files with the data of up to `objects_per_shard` objects."""
+        """Number of shards."""
         return math.ceil(self.num_objects / self.objects_per_shard)
 
     def check(self, sensor: Sensor) -> None:
-        """Raise an error if a field of the collection or its scenario is invalid, or if the pad has the wrong shape.
-
-        Args:
-            sensor: The sensor. Its pad must be square if `symmetries=True` and the scenario allows quarter turns.
-
-        Raises:
-            ValueError: A field is out of range, a name in `categories` is unknown, or the pad of the sensor is not
-                square although the collection needs a square pad. The message names the field.
-        """
+        """Raise a ValueError if a field or the scenario is invalid, or if quarter turns need a square pad."""
         self.scenario.check()
         sides = [float(side) for side in sensor.gel.size]
         quarter_turns = any(symmetry % 2 for symmetry in symmetries_of(self))
         if quarter_turns and sides[0] != sides[1]:
-            raise ValueError(
-                f"symmetries=True needs a square pad, got gel.size={sides} m: give a sensor with a square pad, or set "
-                "symmetries=False"
-            )
+            raise ValueError(f"symmetries=True needs a square pad, got gel.size={sides} m: set symmetries=False")
         if min(self.shares) < 0 or not math.isclose(sum(self.shares), 1):
-            raise ValueError(
-                f"shares={self.shares}, but the shares of training, validation and test must be >= 0 and have sum 1"
-            )
+            raise ValueError(f"shares={self.shares}, but shares must be >= 0 and have sum 1")
         if self.meshes is not None and self.num_objects != len(self.meshes.names):
             count = len(self.meshes.names)
             raise ValueError(
-                f"num_objects={self.num_objects}, but the number of objects in `meshes` is {count}: "
-                f"set num_objects={count}"
+                f"num_objects={self.num_objects}, but `meshes` has {count} objects: set num_objects={count}"
             )
         if self.meshes is None and not self.categories:
             raise ValueError("categories is empty, but it must name at least one class, such as 'bottle'")
@@ -101,10 +85,7 @@ class Collection:
             raise ValueError(f"resolution must be two whole numbers of pixels (height, width), got {self.resolution!r}")
         rendered, most = self.num_rendered, self.num_per_object
         if rendered is not None and not (type(rendered) is int and 1 <= rendered <= most):
-            raise ValueError(
-                f"num_rendered must be a whole number from 1 to num_per_object={most}, or None for all, "
-                f"got {rendered!r}"
-            )
+            raise ValueError(f"num_rendered must be None or from 1 to num_per_object={most}, got {rendered!r}")
 
 
 def class_names(collection: Collection) -> tuple[str, ...]:
@@ -115,23 +96,7 @@ def class_names(collection: Collection) -> tuple[str, ...]:
 
 
 def make_bodies(collection: Collection, indices: np.ndarray) -> list[objects.Body]:
-    """Make some objects of a collection.
-
-    An object without a mesh file is generated at random, from its own random key. The object therefore does not
-    depend on the other entries of `indices`.
-
-    Args:
-        collection: The description of the dataset.
-        indices: Indices of the objects, int `(n,)`.
-
-    Returns:
-        The n objects, in the given order.
-
-    Raises:
-        FileNotFoundError: A mesh file no longer exists.
-        ImportError: `collection.parts` or a mesh file needs a package that is not installed.
-        ValueError: An object cannot be made. The message gives the reason.
-    """
+    """Make the objects of a collection with the given indices, int `(n,)`. Each depends on its own index only."""
     if collection.meshes is not None:
         library, where = open_library(collection.meshes, collection.parts)
         chosen = [collection.meshes.names[i] for i in indices]
@@ -158,10 +123,7 @@ def head(collection: Collection, count: int) -> Collection:
 
 
 def split_objects(collection: Collection) -> dict[str, np.ndarray]:
-    """Split the objects of a collection into parts for training, validation and test.
-
-    The sizes of the parts follow from `collection.shares`. The split is random and depends on `collection.seed`. Each
-    part has nearly the same proportions of the classes, also if the classes have different numbers of objects.
+    """Split the objects of a collection at random into parts with nearly equal proportions of the classes.
 
     Returns:
         Sorted indices of the objects, int `(n,)`, for each of `train`, `validation` and `test`.
@@ -172,26 +134,17 @@ def split_objects(collection: Collection) -> dict[str, np.ndarray]:
     # Each part consists of successive blocks. The objects of each class are spread evenly over the blocks, so the parts
     # have equal proportions of the classes.
     blocks: list[list[int]] = [[] for _ in range(max(map(len, members)))]
-    for own in members:
-        for i, index in enumerate(own.tolist()):
+    for alike in members:
+        for i, index in enumerate(alike.tolist()):
             # A class that lacks one object fills the first blocks, as in datasets that exist already.
-            blocks[i if len(own) >= len(blocks) - 1 else (2 * i + 1) * len(blocks) // (2 * len(own))].append(index)
+            blocks[i if len(alike) >= len(blocks) - 1 else (2 * i + 1) * len(blocks) // (2 * len(alike))].append(index)
     order = np.concatenate([rng.permutation(block) for block in blocks])
     cuts = np.round(np.cumsum(collection.shares)[:-1] * collection.num_objects).astype(int)
     return {name: np.sort(part).astype(np.int64) for name, part in zip(PARTS, np.split(order, cuts), strict=True)}
 
 
 def symmetries_of(collection: Collection) -> tuple[int, ...]:
-    """Return the symmetries under which the first and last frames of each trajectory are rendered.
-
-    A symmetry rotates or mirrors the object on the pad without changing the scenario. With
-    `collection.symmetries=True`, a frame is rendered once for each symmetry of the scenario. Otherwise, it is rendered
-    once, without a transformation.
-
-    Returns:
-        Numbers of the symmetries, from 0 to 7. Symmetry s first mirrors the object (y becomes -y) if s >= 4. It then
-        rotates the object about the z axis by `90 * (s % 4)` degrees. Symmetry 0 is the identity.
-    """
+    """Return the numbers of the symmetries (see `dataset.symmetry`) in which first and last frames are rendered."""
     return collection.scenario.symmetries if collection.symmetries else (0,)
 
 

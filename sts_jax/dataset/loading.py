@@ -12,17 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from sts_jax.dataset import records
-from sts_jax.dataset.collection import PARTS
 from sts_jax.dataset.measurement import Measurement, measured
 from sts_jax.dataset.symmetry import turn, turn_condition
-from sts_jax.storage import DamagedFileError, digest, read_json, sha256
+from sts_jax.storage import digest, read_arrays, read_json, verify
 
 
 class Pairs(NamedTuple):
-    """First and last frames of n trajectories, in memory.
+    """First and last frames of n trajectories and of their turned and mirrored copies.
 
     In arrays of shape `(n, 2, ...)`, index 0 of the second axis is the first frame and index 1 is the last frame.
-    `Dataset.pairs` can add turned and mirrored copies of the trajectories. The number n includes these copies.
     """
 
     visual: np.ndarray  # uint8 (n, 2, height, width, 3): images of the visual stream
@@ -41,17 +39,13 @@ class Pairs(NamedTuple):
     measurements: dict[str, np.ndarray] = {}  # noqa: RUF012 (never changed)
 
     def take(self, rows: np.ndarray | slice) -> "Pairs":
-        """Select trajectories.
-
-        Args:
-            rows: Indices, a bool mask `(n,)`, or a slice such as `slice(10)` for the first ten.
-        """
+        """Select trajectories by indices, a bool mask `(n,)`, or a slice such as `slice(10)`."""
         taken: Pairs = jax.tree.map(lambda leaf: leaf[rows], self)
         return taken
 
 
 class Ends(NamedTuple):
-    """First and last poses of some trajectories, with the true shapes and masses of the objects but without images."""
+    """First and last poses of n trajectories, without images."""
 
     pose: np.ndarray  # float32 (n, 2, 7): first and last pose, mesh frame in the sensor frame
     condition: np.ndarray  # float32 (n, c): input of the scenario such as a jerk (SI units)
@@ -64,10 +58,7 @@ class Ends(NamedTuple):
 
 
 class Views(NamedTuple):
-    """Views of a dataset, in memory. The number of views is m.
-
-    A view is a visual image of an object in a random initial pose, without a trajectory.
-    """
+    """Views of a dataset, in memory."""
 
     visual: np.ndarray  # uint8 (m, height, width, 3): images of the visual stream
     pose: np.ndarray  # float32 (m, 7): mesh frame in the sensor frame, position (m) and quaternion
@@ -78,18 +69,7 @@ class Views(NamedTuple):
 
 
 def reduced(pairs: Pairs, size: int) -> Pairs:
-    """Reduce the images in `pairs` to a lower resolution. Each new pixel is the mean of a square block of pixels.
-
-    Args:
-        pairs: First and last frames of trajectories, with square images.
-        size: New side length of the images (pixels). It must divide the present side length.
-
-    Returns:
-        The pairs with smaller images. A pixel of the segmentation is true if at least half of its block is true.
-
-    Raises:
-        ValueError: The images are not square, or their side length is not a multiple of `size`.
-    """
+    """Reduce the images of pairs as `reduced_images` does."""
     images = {"visual": pairs.visual, "tactile": pairs.tactile, "segmentation": pairs.segmentation[..., None]}
     small = reduced_images(images, size)
     return pairs._replace(visual=small["visual"], tactile=small["tactile"], segmentation=small["segmentation"][..., 0])
@@ -99,16 +79,11 @@ def reduced_images(images: dict[str, np.ndarray], size: int) -> dict[str, np.nda
     """Reduce square images to a lower resolution. Each new pixel is the mean of a square block of pixels.
 
     Args:
-        images: Arrays of images by name, uint8 or bool `(*n, side, side, channels)`. They may have any leading axes
-            `*n`.
-        size: New side length of the images (pixels). It must divide the present side length.
+        images: Images by name, uint8 or bool `(*n, side, side, channels)`.
+        size: New side length (pixels). It must divide `side`.
 
     Returns:
-        The arrays of smaller images by name, `(*n, size, size, channels)`, with the types of the given arrays. A bool
-        pixel is true if at least half of its block is true.
-
-    Raises:
-        ValueError: The images are not square, or their side length is not a multiple of `size`.
+        The smaller images by name, of the same types. A bool pixel is true if at least half of its block is true.
     """
     for image in images.values():
         height, width = image.shape[-3:-1]
@@ -134,13 +109,10 @@ def _means(images: np.ndarray, size: int) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class Dataset:
-    """A dataset that `load` has opened. Images are read on request. All other data are in memory.
-
-    In the shapes of the fields, num is the number of trajectories.
-    """
+    """A dataset that `load` has opened: num trajectories in memory. Images are read on request."""
 
     collection: dict  # content of collection.json
-    identity: str  # SHA-256 of all collected data and of the split
+    identity: str  # SHA-256 of the manifest, and thus of all collected data and of the split
     split: dict[str, np.ndarray]  # indices of the objects in each part: `train`, `validation` and `test`
     trajectory: dict[str, np.ndarray]  # fields of `physics.Trajectory` by name, each (num, ...)
     hidden: dict[str, np.ndarray]  # fields of `physics.Hidden` by name, each (num, ...)
@@ -156,18 +128,7 @@ class Dataset:
     view_record_of: np.ndarray  # int (k,): index of the record of each view in its shard
 
     def images(self, rows: np.ndarray) -> records.Images:
-        """Read the images of some stored frames.
-
-        Args:
-            rows: Indices of the stored frames, int `(n,)`. Index i is the frame that `self.frames[i]` describes.
-
-        Returns:
-            The images of the n frames, in the given order.
-
-        Raises:
-            FileNotFoundError: A shard is missing.
-            DamagedFileError: A shard is damaged. The message names it.
-        """
+        """Read the images of stored frames. Index i of `rows`, int `(n,)`, is the frame of `self.frames[i]`."""
         height, width = self.collection["resolution"]
         out = records.Images(
             np.empty((len(rows), height, width, 3), np.uint8),
@@ -204,12 +165,7 @@ class Dataset:
         return np.flatnonzero(counts == self.trajectory["pose"].shape[1])
 
     def strip(self, trajectory: int) -> records.Images:
-        """Read the images of all frames of one trajectory, in the order of time.
-
-        Args:
-            trajectory: Index of the trajectory. `full_trajectories()` returns the indices of the trajectories that have
-                images of all frames. For all other trajectories, the result has fewer images than there are frames.
-        """
+        """Read all stored images of one trajectory, in the order of time. See `full_trajectories`."""
         rows = np.flatnonzero((self.frames[:, 0] == trajectory) & (self.frames[:, 2] == 0))
         return self.images(rows[np.argsort(self.frames[rows, 1])])
 
@@ -217,15 +173,11 @@ class Dataset:
         """Indices of the trajectories of one part of the split.
 
         Args:
-            part: Name of the part: `train`, `validation` or `test`.
-            rendered: True returns only the trajectories that have images, as the method `pairs` requires. False also
-                returns the trajectories without images, which the method `ends` accepts.
-
-        Raises:
-            ValueError: `part` is not `train`, `validation` or `test`.
+            part: `train`, `validation` or `test`.
+            rendered: True to leave out trajectories without images, which `pairs` refuses and `ends` accepts.
         """
-        found = np.flatnonzero(np.isin(self.trajectory["body"], self._part(part)))
-        return found[np.isin(found, self.rendered())] if rendered else found
+        members = np.flatnonzero(np.isin(self.trajectory["body"], self._part(part)))
+        return members[np.isin(members, self.rendered())] if rendered else members
 
     def _part(self, part: str) -> np.ndarray:
         if part not in self.split:
@@ -233,16 +185,7 @@ class Dataset:
         return self.split[part]
 
     def ends(self, trajectories: np.ndarray) -> Ends:
-        """Return the poses, conditions, outcomes and masses of some trajectories, without their images.
-
-        The trajectories may also be those for which the dataset has no images.
-
-        Args:
-            trajectories: Indices of the trajectories, int `(n,)`.
-
-        Raises:
-            ValueError: An index is not a whole number or is out of range.
-        """
+        """Return the first and last poses of trajectories, which need no images. `trajectories` is int `(n,)`."""
         index = self._checked(trajectories)
         return Ends(
             pose=self.trajectory["pose"][index][:, [0, -1]],
@@ -256,21 +199,7 @@ class Dataset:
         )
 
     def views(self, part: str) -> Views:
-        """Read the views of the objects of one part of the split.
-
-        A view is a visual image of an object in a random initial pose, without a trajectory.
-
-        Args:
-            part: Name of the part: `train`, `validation` or `test`.
-
-        Returns:
-            The images and poses of the views. The arrays are empty if the dataset has none.
-
-        Raises:
-            ValueError: `part` is not `train`, `validation` or `test`.
-            FileNotFoundError: A shard is missing.
-            DamagedFileError: A shard is damaged. The message names it.
-        """
+        """Read the views of one part of the split: `train`, `validation` or `test`. There may be none."""
         rows = np.flatnonzero(np.isin(self.view["body"], self._part(part)))
         height, width = self.collection["resolution"]
         visual = np.empty((len(rows), height, width, 3), np.uint8)
@@ -291,7 +220,7 @@ class Dataset:
         if trajectories.ndim != 1 or (trajectories.size and trajectories.dtype.kind not in "iu"):
             raise ValueError(
                 f"`trajectories` has the type {trajectories.dtype} and the shape {trajectories.shape}, but it must be "
-                "a one-dimensional array of integers. If it is a Boolean mask, give np.flatnonzero(mask) instead."
+                "a list of indices: give np.flatnonzero(mask) for a mask."
             )
         outside = trajectories[(trajectories < 0) | (trajectories >= count)]
         if outside.size:
@@ -303,28 +232,19 @@ class Dataset:
     def pairs(
         self, trajectories: np.ndarray, *, symmetries: bool = False, measurements: Sequence[Measurement] = ()
     ) -> Pairs:
-        """Read the first and last frames of some trajectories, with the true shapes and masses of the objects.
+        """Read the first and last frames of trajectories that have images.
 
         Args:
             trajectories: Indices of the trajectories, int `(n,)`.
-            symmetries: True to add the turned and mirrored copies of the frames, if the dataset contains copies (see
-                `Collection.symmetries`). In the result, each trajectory is directly followed by its copies.
-            measurements: Further modalities to measure. Their values are in `Pairs.measurements`.
-
-        Raises:
-            ValueError: An index is not a whole number or is out of range, or its trajectory has no images. Two
-                measurements have the same name, or a measurement has no function `turn` although `symmetries` is True
-                and the dataset contains copies, or `measure` or `turn` returns a wrong shape, type or value.
-            FileNotFoundError: A shard is missing.
-            DamagedFileError: A shard is damaged. The message names it.
+            symmetries: True to add the stored turned and mirrored copies directly after each trajectory.
+            measurements: Further modalities to measure.
         """
         trajectories = self._checked(trajectories)
         without = trajectories[~np.isin(trajectories, self.rendered())]
         if without.size:
             raise ValueError(
-                f"`trajectories` contains {without[0]}, which has no images: use `ends`, which needs no images, or "
-                "take indices from `members` or `rendered`. In this dataset, each object has images for "
-                f"{self.collection['num_rendered']} of its trajectories (num_rendered)."
+                f"`trajectories` contains {without[0]}, which has no images: use `ends`, or take indices from "
+                "`members` or `rendered`."
             )
         last = self.trajectory["pose"].shape[1] - 1
         kinds = np.unique(self.frames[:, 2]).tolist() if symmetries else [0]
@@ -360,112 +280,41 @@ class Dataset:
 def load(folder: str | Path) -> Dataset:
     """Open and verify a dataset that `collect` has finished. The verification takes about 1 s per GB.
 
-    Args:
-        folder: The folder that `collect` has written.
-
     Raises:
-        FileNotFoundError: The folder or one of its files is missing, or `collect` has not finished the dataset. The
-            message names the file.
-        NotADirectoryError: `folder` is a file.
+        FileNotFoundError: The folder has no dataset, or `collect` has not finished it.
         DamagedFileError: A file is damaged, or belongs to another dataset or shard. The message names the file.
-        ValueError: Another version of the library wrote the dataset in another format.
     """
     folder = Path(folder)
-    path = folder / "collection.json"
-    collection = _read(path)
-    records.check_format(collection, folder)
-    objects, each = (_whole_number(collection, name, path) for name in ("num_objects", "objects_per_shard"))
-    split = read_split(folder / "split.json", objects)
-    made_of, seen_by = digest(collection), digest(_read(folder / "sensor.json"))
-    count = -(-objects // each)
-    shards, parts = [], []
-    for index in range(count):
-        path = records.shard_path(folder, count, index)
-        if not path.with_suffix(".npz").exists():
-            raise FileNotFoundError(
-                f"{path.with_suffix('.npz')} is missing: the collection is not finished. Call `collect` to continue it."
-            )
-        parts.append(records.read_shard(path, records.Identity(made_of, seen_by, index)))
-        shards.append(path)
+    if folder.is_file():
+        raise NotADirectoryError(f"{folder} is a file: give the folder of a collected dataset.")
+    manifest = records.manifest_of(folder)
+    if manifest is None or "shards" not in manifest.facts:
+        raise FileNotFoundError(f"{folder} is not a collected dataset: give another folder, or call `collect`.")
+    count = manifest.facts["shards"]
+    files = [records.shard_files(index, count) for index in range(count)]
+    for name in (name for both in files for name in both if name not in manifest.files):
+        raise FileNotFoundError(
+            f"{folder / name} is missing: the collection is not finished. Call `collect` to continue it."
+        )
+    verify(folder, manifest, records.remedy(folder))
+    parts = [read_arrays(folder / table, records.remedy(folder)) for _, table in files]
     starts = np.cumsum([0] + [len(part["trajectory/outcome"]) for part in parts])
     leaves = {key: np.concatenate([part[key] for part in parts]) for key in parts[0] if key != "frames"}
     sizes = [len(part["frames"]) for part in parts]
     views = [len(part["view/body"]) for part in parts]
-    contents = [sha256(shard.with_suffix(".npz")) for shard in shards]  # each contains the checksum of its images
+    split = read_json(folder / "split.json", records.remedy(folder))
     return Dataset(
-        collection=collection,
-        identity=digest([made_of, seen_by, {name: part.tolist() for name, part in split.items()}, contents]),
-        split=split,
+        collection=read_json(folder / "collection.json", records.remedy(folder)),
+        identity=digest(manifest._asdict()),
+        split={name: np.array(part, np.int64) for name, part in split.items()},
         **{
             group: {k.split("/")[1]: v for k, v in leaves.items() if k.startswith(f"{group}/")}
             for group in ("trajectory", "hidden", "solid", "view")
         },
         frames=np.concatenate([p["frames"] + np.array([s, 0, 0]) for p, s in zip(parts, starts[:-1], strict=True)]),
-        shards=tuple(shards),
+        shards=tuple(folder / images for images, _ in files),
         shard_of=np.repeat(np.arange(count), sizes),
         record_of=np.concatenate([np.arange(size) for size in sizes]),
         view_shard_of=np.repeat(np.arange(count), views),
         view_record_of=np.concatenate([size + np.arange(k) for size, k in zip(sizes, views, strict=True)]),
     )
-
-
-def _read(path: Path, remedy: str | None = None) -> Any:
-    """Read a JSON file of a dataset. Errors name the file and the remedy."""
-    if path.parent.exists() and not path.parent.is_dir():
-        raise NotADirectoryError(f"{path.parent} is a file: give the folder of a collected dataset.")
-    try:
-        return read_json(path, remedy or f"delete {path.parent} and collect again")
-    except FileNotFoundError:
-        raise FileNotFoundError(
-            f"{path} is missing: {path.parent} is not a collected dataset. Give the folder of "
-            "a collected dataset, or call `collect`."
-        ) from None
-
-
-def _whole_number(collection: dict, name: str, path: Path) -> int:
-    """A field of `collection.json`, which must be a whole number of at least 1."""
-    value = collection.get(name)
-    if type(value) is not int or value < 1:
-        raise DamagedFileError(
-            f"{path}: {name} must be a whole number of at least 1, got {value!r}: "
-            f"delete {path.parent} and collect again."
-        )
-    return value
-
-
-def read_split(path: Path, num_objects: int) -> dict[str, np.ndarray]:
-    """Read `split.json`, and check that each object is in exactly one part.
-
-    Args:
-        path: Path of the file.
-        num_objects: Number of objects in the dataset.
-
-    Returns:
-        Indices of the objects, int `(n,)`, for each of `train`, `validation` and `test`.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        DamagedFileError: The file is damaged. The message names it and the remedy.
-    """
-    remedy = f"delete {path} and start the collection again, which writes the file anew"
-    content = _read(path, remedy)
-    if not isinstance(content, dict) or set(content) != set(PARTS):
-        parts = ", ".join(map(repr, content)) if isinstance(content, dict) else f"a {type(content).__name__}"
-        raise DamagedFileError(f"{path} must have the parts {', '.join(PARTS)}, got {parts}: {remedy}.")
-    for name, part in content.items():
-        if not isinstance(part, list) or not all(type(i) is int for i in part):
-            raise DamagedFileError(f"{path}: {name} must be a list of whole numbers, got {part!r:.60}: {remedy}.")
-        outside = [i for i in part if not 0 <= i < num_objects]
-        if outside:
-            raise DamagedFileError(
-                f"{path}: {name} contains object {outside[0]}, but the objects are 0 to {num_objects - 1}: {remedy}."
-            )
-    named = np.array([i for part in content.values() for i in part], np.int64)
-    times = np.bincount(named, minlength=num_objects)
-    if (times != 1).any():
-        number = int(np.flatnonzero(times != 1)[0])
-        raise DamagedFileError(
-            f"{path}: object {number} must be in exactly one of {', '.join(content)}, but it occurs {times[number]} "
-            f"times: {remedy}."
-        )
-    return {name: np.array(part, np.int64) for name, part in content.items()}

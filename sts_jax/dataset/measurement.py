@@ -11,13 +11,7 @@ NAMES = ("visual", "tactile", "pose", "state")  # reserved names of the library'
 
 @dataclasses.dataclass(frozen=True)
 class Measurement:
-    """Specification of a further modality, such as the contact force or an image of a second camera.
-
-    Datasets, `mvae` models, `Predictor` and the evaluation need no other information about the modality.
-
-    Raises:
-        ValueError: The name, the shape, the scale or the weight is not allowed.
-    """
+    """Specification of a further modality, such as the contact force or an image of a second camera."""
 
     name: str  # name of the modality, other than `visual`, `tactile`, `pose` and `state`
     shape: tuple[int, ...]  # (size,) for a vector of numbers, or (height, width, channels) for an image in [0, 1]
@@ -35,8 +29,7 @@ class Measurement:
     def __post_init__(self) -> None:
         if not self.name.isidentifier() or self.name in NAMES:
             raise ValueError(
-                f"name of a measurement is {self.name!r}, but it must be a Python identifier other than "
-                f"{', '.join(NAMES)}: give another name, such as 'wrench'"
+                f"name of a measurement is {self.name!r}: give a Python identifier other than {', '.join(NAMES)}"
             )
         if (
             not isinstance(self.shape, tuple)
@@ -50,14 +43,9 @@ class Measurement:
         for field in ("scale", "weight"):
             value = getattr(self, field)
             if not isinstance(value, int | float | np.number) or not 0 < value < np.inf:
-                raise ValueError(
-                    f"measurement {self.name!r}: {field} is {getattr(self, field)}, but it must be > 0 and finite"
-                )
+                raise ValueError(f"measurement {self.name!r}: {field} is {value}, but it must be > 0 and finite")
         if self.is_image and self.scale != 1:
-            raise ValueError(
-                f"measurement {self.name!r}: scale is {self.scale}, but an image has values in [0, 1] and needs no "
-                "scale: leave out the argument scale"
-            )
+            raise ValueError(f"measurement {self.name!r}: scale is {self.scale}, but an image needs no scale")
 
     @property
     def is_image(self) -> bool:
@@ -68,48 +56,37 @@ class Measurement:
 def measured(
     measurements: Sequence[Measurement], data: Any, trajectories: np.ndarray, symmetries: Sequence[int]
 ) -> dict[str, np.ndarray]:
-    """Measure the first and last frames of trajectories, optionally after turning and mirroring the trajectories.
-
-    Args:
-        measurements: The specifications of the modalities.
-        data: The dataset, a `Dataset`.
-        trajectories: Indices of n trajectories, int `(n,)`.
-        symmetries: Indices of k symmetries (`dataset.symmetry`). Each trajectory is turned or mirrored by each of these
-            symmetries, which gives k copies. The symmetry with index 0 leaves the trajectory unchanged.
+    """Measure the first and last frames of n trajectories of a `Dataset`, each in k symmetries of the pad.
 
     Returns:
         The values of each modality by name, uint8 or float32 `(n * k, 2, *shape)`. The k copies of a trajectory are
         consecutive.
-
-    Raises:
-        ValueError: Two measurements have the same name. The function `measure` or `turn` returns a wrong shape or type,
-            infinite numbers (NaN is allowed), or image values outside [0, 1]. Copies are requested, but a measurement
-            has no function `turn`.
     """
-    names = [own.name for own in measurements]
+    names = [measurement.name for measurement in measurements]
     if len(set(names)) < len(names):
         raise ValueError(f"measurements has the names {names}, but each name may occur only once: rename one")
-    return {own.name: _measured(own, data, trajectories, symmetries) for own in measurements}
+    return {each.name: _measured(each, data, trajectories, symmetries) for each in measurements}
 
 
-def _measured(own: Measurement, data: Any, trajectories: np.ndarray, symmetries: Sequence[int]) -> np.ndarray:
+def _measured(measurement: Measurement, data: Any, trajectories: np.ndarray, symmetries: Sequence[int]) -> np.ndarray:
     """Measure one modality in all trajectories and copies."""
-    if own.turn is None and any(symmetries):
+    name, turn = measurement.name, measurement.turn
+    if turn is None and any(symmetries):
         raise ValueError(
-            f"measurement {own.name!r} has no function `turn`, which symmetries=True needs for the turned and mirrored "
-            "copies of the trajectories: give the measurement this function, or pass symmetries=False"
+            f"measurement {name!r} has no function `turn`, which symmetries=True needs: give one, or pass "
+            "symmetries=False"
         )
-    values = _checked(own, "measure", own.measure(data, trajectories), len(trajectories))
+    values = _checked(measurement, "measure", measurement.measure(data, trajectories), len(trajectories))
     copies = [values]
-    if own.turn is not None:
+    if turn is not None:
         copies = [
-            values if number == 0 else _checked(own, "turn", own.turn(values.copy(), number), len(values))
+            values if number == 0 else _checked(measurement, "turn", turn(values.copy(), number), len(values))
             for number in symmetries
         ]
     kinds = {str(copy.dtype) for copy in copies}
     if len(kinds) > 1:
         raise ValueError(
-            f"measurement {own.name!r}: the functions `measure` and `turn` returned values of the types "
+            f"measurement {name!r}: the functions `measure` and `turn` returned values of the types "
             f"{' and '.join(sorted(kinds))}, but the types must be equal: return uint8 or floats in both"
         )
     return np.stack(copies, axis=1).reshape(-1, *values.shape[1:])
@@ -131,7 +108,7 @@ def _checked(measurement: Measurement, function: str, values: Any, count: int) -
         raise ValueError(f"{start}infinite numbers: return finite numbers, and NaN for values that were not measured")
     if measurement.is_image and (np.nanmin(values, initial=0) < 0 or np.nanmax(values, initial=0) > 1):
         raise ValueError(
-            f"{start}an image with values from {np.nanmin(values):.3g} to {np.nanmax(values):.3g}, but an image must "
-            "have values in [0, 1] or the type uint8: divide by 255 if the values are 8-bit, or return uint8"
+            f"{start}an image with values from {np.nanmin(values):.3g} to {np.nanmax(values):.3g}: return values in "
+            "[0, 1], or uint8"
         )
     return values

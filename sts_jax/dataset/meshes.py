@@ -41,38 +41,26 @@ def survey_meshes(
 ) -> tuple[Meshes, str]:
     """Search a folder for mesh files that a scenario can use.
 
-    If several files contain the same mesh, whatever their names and formats, only one of these files is used. As a
-    result, no object is in both the training part and the test part of a dataset.
+    Of several files with the same mesh, whatever their names and formats, one is used. No object is therefore in both
+    the training part and the test part of a dataset.
 
     Args:
-        folder: Folder of mesh files with one sub-folder per class, or folder of the dataset ShapeNetSem (see
-            `objects.library`).
+        folder: A folder as in `objects.library`.
         scenario: The scenario in which the objects are simulated.
         classes: The classes to use, a subset of `mesh_classes(folder)`. Empty means all.
         scale: Length of one unit of the files (m). Default: the value in ShapeNetSem's table, or 1 m for other files.
         up: The files' axis that becomes +z. Default: the axis in ShapeNetSem's table, y for glTF, z for other files.
-        parts: True to split an object into convex parts if its convex hull reaches more than 2 mm beyond its surface.
-            This needs the package coacd.
-        cache: Folder that keeps the processed objects, so that later calls read them faster. None keeps nothing.
-        progress: Function that is called with a line of text after each object.
+        parts: See `Collection.parts`.
+        cache: Folder that keeps the processed objects for later calls.
+        progress: Called with a line of text after each object.
 
     Returns:
-        The usable objects, and a text. The text describes each usable object, and gives the reason for each object
-        that is left out.
-
-    Raises:
-        FileNotFoundError: The folder does not exist.
-        ImportError: `parts` or a mesh file needs a package that is not installed.
-        ValueError: The folder has no mesh file that the scenario can use, the folder lacks one of the classes, or
-            `scale` or `up` is out of range.
+        The usable objects, and a text that describes each of them and the reason for each object that is left out.
     """
     library = objects.library(folder, cache=cache, scale=scale, up=up, parts=parts)
     unknown = sorted(set(classes) - set(library.classes))
     if unknown:
-        raise ValueError(
-            f"the argument `classes` contains {', '.join(unknown)}, but {folder} has only the classes "
-            f"{', '.join(library.classes)}: choose among these"
-        )
+        raise ValueError(f"`classes` contains {', '.join(unknown)}, but {folder} has {', '.join(library.classes)}")
     items = tuple(item for item in library.items if not classes or item.label in classes)
     library, listing = objects.survey(dataclasses.replace(library, items=items), progress=progress)
     usable, digest = [], hashlib.sha256()
@@ -93,10 +81,7 @@ def survey_meshes(
         usable.append(item)
         digest.update(item.name.encode() + hashlib.sha256(item.path.read_bytes()).digest())
     if not usable:
-        raise ValueError(
-            f"{folder} has no object that can be used in {type(scenario).__name__}. Give another folder, or repair the "
-            f"files. The objects were left out for these reasons:\n{listing}"
-        )
+        raise ValueError(f"{folder} has no object that can be used in {type(scenario).__name__}:\n{listing}")
     names, labels = tuple(item.name for item in usable), tuple(item.label for item in usable)
     kept = None if cache is None else str(cache)
     return Meshes(str(folder), names, labels, digest.hexdigest(), kept, scale, up), listing
@@ -119,29 +104,12 @@ def _same(one: np.ndarray, other: np.ndarray) -> bool:
 
 
 def mesh_classes(folder: str | os.PathLike[str]) -> tuple[str, ...]:
-    """List the classes of the mesh files in a folder, without opening a mesh.
-
-    Args:
-        folder: Folder of mesh files with one sub-folder per class, or folder of the dataset ShapeNetSem (see
-            `objects.library`).
-
-    Raises:
-        FileNotFoundError: The folder does not exist.
-        ValueError: The folder has no mesh.
-    """
+    """List the classes of the mesh files in a folder, without opening a mesh."""
     return objects.library(folder).classes
 
 
 @functools.lru_cache
 def open_library(meshes: Meshes, parts: bool) -> tuple[objects.Library, dict[str, int]]:
-    """Make an `objects.Library` of all mesh files in the folder `meshes.folder`, without opening a mesh.
-
-    Args:
-        meshes: Result of `survey_meshes`. The library also contains the mesh files that `survey_meshes` left out.
-        parts: True to split an object into convex parts if its convex hull reaches more than 2 mm beyond its surface.
-
-    Returns:
-        The library, and a dictionary from the name of each object to its index in `library.items`.
-    """
+    """Library of all mesh files in `meshes.folder`, and the index of each object in its items, by name."""
     library = objects.library(meshes.folder, cache=meshes.cache, scale=meshes.scale, up=meshes.up, parts=parts)
     return library, {item.name: index for index, item in enumerate(library.items)}

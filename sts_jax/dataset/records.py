@@ -1,15 +1,11 @@
-"""Reading and writing of shards, the files of a dataset.
+"""The files of a dataset: shards, and the manifest that lists them.
 
-A file is written as a whole or not at all, and the same inputs give the same bytes.
+A file is written as a whole or not at all, and the same inputs give the same bytes. `NAME.array_record` has one record
+per rendered frame: the visual image, the tactile image (`uint8`, `(height, width, 3)`) and the segmentation (bits), in
+that order, and then one record per view. `NAME.npz` has all other data of the shard as named arrays.
 
-A shard is a pair of files with the data of some objects. `NAME.array_record` has one record per rendered frame: the
-visual image, the tactile image (`uint8`, `(height, width, 3)`) and the segmentation (bits), in that order. The frames
-are followed by one record per view. A view is a visual image of an object in an initial pose from which no trajectory
-is simulated.
-
-`NAME.npz` contains the `Identity` of the shard, the SHA-256 of `NAME.array_record`, and all other data as named arrays.
-The identity and the SHA-256 show a reader whether one of the two files comes from another shard or dataset. `NAME.npz`
-is written last, and a shard without `NAME.npz` counts as missing.
+`manifest.json` lists both files of every finished shard, and the descriptions. A shard that it does not list counts as
+missing.
 """
 
 from collections.abc import Callable, Iterable
@@ -19,151 +15,66 @@ from typing import Any, NamedTuple
 import numpy as np
 from array_record.python.array_record_module import ArrayRecordReader, ArrayRecordWriter
 
-from sts_jax import physics
-from sts_jax.storage import DamagedFileError, read_arrays, sha256, write_arrays, write_whole
+from sts_jax.storage import MANIFEST, DamagedFileError, Manifest, read_json, read_manifest, write_whole
 
-FORMAT = 4  # format of a dataset's files, incremented when older files can no longer be read
-ARRAYS = {  # names of the arrays in a shard's .npz, apart from its identity
-    *(f"trajectory/{name}" for name in physics.Trajectory._fields if name != "hidden"),
-    *(f"hidden/{name}" for name in physics.Hidden._fields),
-    *(f"solid/{name}" for name in ("support", "mirrored", "mass", "com")),
-    *(f"view/{name}" for name in ("pose", "body", "support", "mass", "com")),
-    "frames",
-    "left_out",
-}
+FORMAT = 5  # format of a dataset's files, incremented when older files can no longer be read
+DESCRIPTIONS = ("collection.json", "sensor.json", "split.json")
 # One record per group, because a read decompresses the whole group.
 WRITER_OPTIONS = "group_size:1,zstd:3"
 
 
 class Images(NamedTuple):
-    """The visual images, tactile images and segmentations of n rendered frames, as a dataset stores them."""
+    """The images of n rendered frames, as a dataset stores them."""
 
     visual: np.ndarray  # uint8 (n, height, width, 3)
     tactile: np.ndarray  # uint8 (n, height, width, 3)
     segmentation: np.ndarray  # bool (n, height, width)
 
 
-class Identity(NamedTuple):
-    """Identity of a shard: its dataset, sensor and index. A shard is a pair of files with the data of some objects."""
-
-    collection: str  # SHA-256 of the content of collection.json
-    sensor: str  # SHA-256 of the content of sensor.json
-    shard: int  # index of the shard
+def shard_files(index: int, count: int) -> tuple[str, str]:
+    """Names of the image file and the array file of a shard."""
+    name = f"shard-{index:05d}-of-{count:05d}"
+    return f"{name}.array_record", f"{name}.npz"
 
 
-def shard_path(folder: Path, count: int, index: int) -> Path:
-    """Path of the `.array_record` file with the images of a shard.
-
-    Args:
-        folder: The folder of the dataset.
-        count: Number of shards in the dataset.
-        index: Index of the shard. The first shard has the index 0.
-    """
-    return folder / f"shard-{index:05d}-of-{count:05d}.array_record"
+def remedy(folder: Path) -> str:
+    """The remedy for a damaged file of a dataset."""
+    return (
+        f"restore it, or delete it (of a shard both files) and collect into {folder} again, which makes only what is "
+        "missing"
+    )
 
 
-def check_format(content: Any, folder: Path) -> None:
-    """Check that this version of the library can read a dataset.
-
-    Args:
-        content: The content of the dataset's `collection.json`.
-        folder: The folder of the dataset, for messages.
-
-    Raises:
-        DamagedFileError: The content does not describe a dataset.
-        ValueError: The dataset was written by an older or newer version of the library.
-    """
-    if not isinstance(content, dict):
-        raise DamagedFileError(
-            f"{folder / 'collection.json'} does not describe a dataset: delete {folder} and collect the dataset again."
-        )
-    written = content.get("format", 1)  # the first format had no number
-    if written != FORMAT:
-        raise ValueError(
-            f"{folder} is a dataset of format {written!r}, but this version of sts_jax reads format {FORMAT}: "
-            f"delete {folder} and collect again, or choose another folder."
-        )
-
-
-def write_shard(
-    path: Path, frames: Iterable[tuple[np.ndarray, ...]], arrays: dict[str, np.ndarray], identity: Identity
-) -> None:
-    """Write the two files of a shard: the images (`.array_record`) and all other data (`.npz`).
-
-    Args:
-        path: The `.array_record` file. The `.npz` file has the same path except for the suffix.
-        frames: Batches of images in the order in which they are stored. The first batches have frames of trajectories,
-            and each is a tuple `Images`. The last batches have views, and each is a tuple with one array of n visual
-            images, uint8 `(n, height, width, 3)`. A view is a visual image of an object in an initial pose from which
-            no trajectory is simulated.
-        arrays: All other data, one array for each name in `records.ARRAYS`.
-        identity: The identity of the shard, which `read_shard` checks.
-
-    Raises:
-        OSError: A file cannot be written. The message names it.
-    """
-    write_images(path, frames)
-    known = {f"identity/{name}": np.array(value) for name, value in identity._asdict().items()}
-    write_arrays(path.with_suffix(".npz"), {**arrays, **known, "identity/images": np.array(sha256(path))})
-
-
-def read_shard(path: Path, identity: Identity) -> dict[str, np.ndarray]:
-    """Read the arrays of a shard, after checking that its `.array_record` and `.npz` files belong together.
-
-    Args:
-        path: The `.array_record` file. The `.npz` file with the arrays is next to it.
-        identity: The identity that the shard must have.
+def manifest_of(folder: Path) -> Manifest | None:
+    """Read the manifest of a dataset, and check that this version of the library can read the dataset.
 
     Returns:
-        The arrays given to `write_shard`.
-
-    Raises:
-        FileNotFoundError: A file is missing. The message names the file.
-        DamagedFileError: A file is damaged, or belongs to another shard or dataset. The message names the file.
+        The manifest, or None if nothing was collected into the folder.
     """
-    small = path.with_suffix(".npz")
-    again = (
-        f"delete {small.name} and {path.name}, then start the collection again. The collection makes only the missing "
-        "shards"
-    )
-    arrays = read_arrays(small, again)
-    names = {f"identity/{name}" for name in (*Identity._fields, "images")}
-    lacking = sorted((names | ARRAYS) - set(arrays))
-    if lacking:
-        raise DamagedFileError(f"{small} lacks the arrays {', '.join(lacking)}: {again}.")
-    there = {name.partition("/")[2]: arrays.pop(name).item() for name in names}
-    if there["shard"] != identity.shard:
-        raise DamagedFileError(
-            f"{small} contains the data of shard {there['shard']} instead of shard {identity.shard}: {again}."
-        )
-    for name in ("collection", "sensor"):
-        if there[name] != getattr(identity, name):
-            raise DamagedFileError(
-                f"{small} was made with a {name}.json that differs from {path.parent / name}.json: restore the "
-                f"original {name}.json, or {again}."
+    path = folder / "collection.json"
+    if path.exists():
+        content = read_json(path, remedy(folder))
+        written = content.get("format", 1) if isinstance(content, dict) else None  # the first format had no number
+        if written != FORMAT:
+            raise ValueError(
+                f"{folder} is a dataset of format {written!r}, but this version of sts_jax reads format {FORMAT}: "
+                "collect into another folder, or read this one with the version that wrote it."
             )
-    if not path.is_file():
-        raise _missing(path)
-    if sha256(path) != there["images"]:
+    manifest = read_manifest(folder, f"restore it, or collect into another folder than {folder}")
+    if manifest is None and any(folder.glob("shard-*")):
         raise DamagedFileError(
-            f"{path} is damaged or belongs to another shard (the SHA-256 of the file differs from the value in "
-            f"{small.name}): {again}."
+            f"{folder / MANIFEST} is missing, but {folder} has shards: restore it, or collect into another folder."
         )
-    return arrays
+    return manifest
 
 
 def write_images(path: Path, frames: Iterable[tuple[np.ndarray, ...]]) -> None:
-    """Write images to an array_record file, as a whole or not at all.
-
-    A record of the file contains the images of one frame, one image of each kind.
+    """Write batches of images to an array_record file, as a whole or not at all.
 
     Args:
         path: The file.
-        frames: Batches of images. A batch of n frames is a tuple of arrays `(n, ...)`, one array per kind of image.
-            `Images` is such a tuple.
-
-    Raises:
-        OSError: The file cannot be written. The message names it.
+        frames: Batches. A batch of n frames is a tuple of arrays `(n, ...)`, one array per kind of image, such as
+            `Images`.
     """
 
     def write(temporary: Path) -> None:
@@ -186,21 +97,13 @@ def _or_os_error(call: Callable[..., Any], *args: Any) -> Any:
 
 
 def read_images(path: Path, indices: np.ndarray, *, resolution: tuple[int, int], total: int) -> Images:
-    """Read some frames of a shard.
+    """Read some frames of a shard, in the given order.
 
     Args:
         path: The `.array_record` file.
-        indices: Indices of the frames in the file, int `(n,)`.
+        indices: Indices of the records, int `(n,)`.
         resolution: Height and width of every image (pixels).
-        total: Number of records (frames and views) that the file must contain. A view is a visual image of an object in
-            an initial pose from which no trajectory is simulated.
-
-    Returns:
-        The images of the n frames, in the given order.
-
-    Raises:
-        FileNotFoundError: The file does not exist.
-        DamagedFileError: The file is truncated or does not contain `total` records.
+        total: Number of records that the file must contain. A truncated file may open without an error.
     """
     height, width = resolution
     size = height * width * 3
@@ -215,48 +118,21 @@ def read_images(path: Path, indices: np.ndarray, *, resolution: tuple[int, int],
 
 
 def read_views(path: Path, indices: np.ndarray, *, resolution: tuple[int, int], total: int) -> np.ndarray:
-    """Read some views of a shard.
-
-    A view is a visual image of an object in an initial pose from which no trajectory is simulated.
-
-    Args:
-        path: The `.array_record` file.
-        indices: Indices of the views among all records of the file, int `(n,)`. The file contains all frames first,
-            then the views.
-        resolution: Height and width of every image (pixels).
-        total: Number of records (frames and views) that the file must contain.
-
-    Returns:
-        The n images in the given order, uint8 `(n, height, width, 3)`.
-
-    Raises:
-        FileNotFoundError: The file does not exist.
-        DamagedFileError: The file is truncated or does not contain `total` records.
-    """
+    """Read some views of a shard as uint8 `(n, height, width, 3)`. The arguments are those of `read_images`."""
     return _read_records(path, indices, total).reshape(-1, *resolution, 3)
 
 
 def _read_records(path: Path, indices: np.ndarray, total: int) -> np.ndarray:
     """Read some records of equal length, `uint8 (n, length)`."""
     if not path.is_file():
-        raise _missing(path)
-    again = (
-        f"delete {path.name} and {path.with_suffix('.npz').name}, then start the collection again. The collection "
-        "makes only the missing shards"
-    )
+        raise FileNotFoundError(f"{path} is missing: {remedy(path.parent)}.")
     try:
         reader = ArrayRecordReader(str(path))
         count = reader.num_records()
         records = reader.read([int(i) for i in indices]) if count == total and len(indices) else []
         reader.close()
     except (RuntimeError, ValueError, IndexError) as error:
-        raise DamagedFileError(f"{path} is damaged ({error}): {again}.") from error
+        raise DamagedFileError(f"{path} is damaged ({error}): {remedy(path.parent)}.") from error
     if count != total:
-        raise DamagedFileError(
-            f"{path} is damaged, because its number of records is {count} instead of {total}: {again}."
-        )
+        raise DamagedFileError(f"{path} is damaged: it has {count} records instead of {total}: {remedy(path.parent)}.")
     return np.frombuffer(b"".join(records), np.uint8).reshape(len(records), -1)
-
-
-def _missing(path: Path) -> FileNotFoundError:
-    return FileNotFoundError(f"{path} is missing: delete {path.with_suffix('.npz').name} and collect again.")

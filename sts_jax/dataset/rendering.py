@@ -40,26 +40,20 @@ def render(
     views: dict[str, np.ndarray],
     report: Callable[[int], None],
 ) -> Iterator[tuple[np.ndarray, ...]]:
-    """Render the images of a shard in batches, on all CPU cores.
-
-    A shard contains frames of simulated trajectories, followed by views. A view is a visual image of an object in an
-    initial pose from which no trajectory is simulated.
+    """Render the images of a shard in batches, on all CPU cores: frames of trajectories, then views.
 
     Args:
         collection: The description of the dataset.
         sensor: The sensor.
         bodies: The objects of the shard.
-        trajectory: The trajectories of these objects as NumPy arrays. `trajectory.body` is an index into `bodies`.
-        frames: The m frames to render, int `(m, 3)`. A row contains the index of the trajectory, the index of the frame
-            in the trajectory and the number of the symmetry (see `symmetries_of`). The rows are sorted by object. The
-            mirrored frames of an object (symmetries 4 to 7) follow its other frames.
-        views: The v views, sorted by object. The array `pose`, `(v, 7)`, has the poses of the objects: position (m) and
-            quaternion (w, x, y, z). The array `body`, int `(v,)`, has indices into `bodies`.
-        report: Function that is called after each batch with the number of frames and views that are finished so far.
+        trajectory: Their trajectories as NumPy arrays. `trajectory.body` is an index into `bodies`.
+        frames: Trajectory, frame and symmetry of each image, int `(m, 3)`, sorted by object. The mirrored frames of an
+            object follow its other frames.
+        views: `pose` `(v, 7)` and `body`, int `(v,)`, an index into `bodies`, sorted by object.
+        report: Called after each batch with the number of finished frames and views.
 
     Yields:
-        Batches of images in the order in which they are stored. A batch of frames has the visual images, the tactile
-        images and the segmentations. A batch of views is a tuple with only the visual images.
+        Batches in the order of storage: visual images, tactile images and segmentations, or visual images of views.
     """
     size = frames_per_call()
     turned = {
@@ -96,10 +90,7 @@ def render(
 
 
 def frames_per_call() -> int:
-    """Number of frames that the library passes to each call of `render_uint8`.
-
-    Calls with equal numbers of frames share one compiled program.
-    """
+    """Number of frames in each of the library's calls of `render_uint8`, which share one compiled program."""
     return CPU_RENDER_BATCH if jax.default_backend() == "cpu" else RENDER_BATCH
 
 
@@ -113,19 +104,10 @@ def render_uint8(
     resolution: tuple[int, int],
     crop: bool,
 ) -> tuple[UInt8[Array, "n h w 3"], UInt8[Array, "n h w 3"], Array]:
-    """Render n frames of one object, as 8-bit images.
-
-    Args:
-        sensor: The sensor.
-        body: The object.
-        pose: Poses of the object (its mesh frame) in the sensor frame: position (m) and quaternion (w, x, y, z).
-        wrench: Wrenches of the pad on the object: force (N) and moment about the sensor's origin (N m).
-        resolution: Height h and width w of the images (pixels).
-        crop: True to show only a window around the object. False to show the whole pad.
+    """Render n frames of one object as `sense` does, as 8-bit images.
 
     Returns:
-        The visual images, the tactile images, and the segmentation, bool `(n, h, w)`, which is true in pixels that show
-        the object.
+        The visual images, the tactile images, and the segmentation, bool `(n, h, w)`.
     """
 
     def one(item: tuple[Array, Array]) -> tuple[Array, Array, Array]:
@@ -138,16 +120,7 @@ def render_uint8(
 
 
 def empty_frame(sensor: Sensor, collection: Collection) -> records.Images:
-    """Render the sensor without an object, in the resolution of a collection.
-
-    Args:
-        sensor: The sensor.
-        collection: The description of the dataset.
-
-    Returns:
-        The visual and the tactile image, uint8 `(height, width, 3)`, and the segmentation, bool `(height, width)`. The
-        segmentation is false everywhere.
-    """
+    """Render the sensor without an object in the resolution of a collection, without a leading axis."""
     body = make_bodies(collection, np.array([0]))[0]
     # The number of frames is that of `render`. After a collection, the program is therefore compiled already.
     gone = np.tile(np.array([0, 0, -1, 1, 0, 0, 0], np.float32), (frames_per_call(), 1))

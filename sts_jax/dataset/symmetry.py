@@ -2,8 +2,6 @@
 
 Symmetry s is a rotation about the z axis by `90 * (s % 4)` degrees. If s >= 4, a reflection (y becomes -y) precedes the
 rotation. Symmetry 0 is the identity.
-
-A condition is the input that a scenario applies to a trajectory, such as an acceleration of the pad.
 """
 
 import math
@@ -15,16 +13,7 @@ from sts_jax import geometry
 
 
 def turn(pose: Float[Array, "*n 7"], symmetry: int) -> Float[Array, "*n 7"]:
-    """Rotate or mirror poses by a symmetry of the pad.
-
-    Symmetries 4 to 7 mirror the object. The results of these symmetries are poses of the mirrored body,
-    `objects.mirror(body)`.
-
-    Args:
-        pose: Pose of the object (its mesh frame) in the sensor frame: position (m) and quaternion (w, x, y, z).
-        symmetry: Number of the symmetry, 0 to 7. Symmetry s is a rotation about the z axis by `90 * (s % 4)` degrees.
-            If s >= 4, a reflection (y becomes -y) precedes the rotation. Symmetry 0 is the identity.
-    """
+    """Rotate or mirror poses. Symmetries 4 to 7 give poses of the mirrored body, `objects.mirror(body)`."""
     if symmetry >= 4:
         pose = pose * jnp.array([1.0, -1, 1, 1, -1, 1, -1])
     spin = geometry.quat_from_rotvec(jnp.array([0.0, 0.0, symmetry % 4 * math.pi / 2]))
@@ -34,13 +23,7 @@ def turn(pose: Float[Array, "*n 7"], symmetry: int) -> Float[Array, "*n 7"]:
 
 
 def turn_wrench(wrench: Float[Array, "*n 6"], symmetry: int) -> Float[Array, "*n 6"]:
-    """Rotate or mirror wrenches by a symmetry of the pad.
-
-    Args:
-        wrench: Force (N) and moment about the sensor's origin (N m).
-        symmetry: Number of the symmetry, 0 to 7. Symmetry s is a rotation about the z axis by `90 * (s % 4)` degrees.
-            If s >= 4, a reflection (y becomes -y) precedes the rotation. Symmetry 0 is the identity.
-    """
+    """Rotate or mirror wrenches: force (N) and moment about the sensor's origin (N m)."""
     if symmetry >= 4:
         wrench = wrench * jnp.array([1.0, -1, 1, -1, 1, -1])
     spin = geometry.quat_from_rotvec(jnp.array([0.0, 0.0, symmetry % 4 * math.pi / 2]))
@@ -49,15 +32,11 @@ def turn_wrench(wrench: Float[Array, "*n 6"], symmetry: int) -> Float[Array, "*n
 
 
 def turn_condition(condition: Float[Array, "*n c"], symmetry: int, vectors: int = 1) -> Float[Array, "*n c"]:
-    """Rotate or mirror conditions by a symmetry of the pad.
-
-    A condition is the input that a scenario applies to a trajectory, such as an acceleration of the pad.
+    """Rotate or mirror conditions.
 
     Args:
-        condition: The c components of each condition. Vectors (x, y) in the plane of the pad come first, and scalars
-            follow. The symmetries do not change the scalars.
-        symmetry: Number of the symmetry, 0 to 7. Symmetry s is a rotation about the z axis by `90 * (s % 4)` degrees.
-            If s >= 4, a reflection (y becomes -y) precedes the rotation. Symmetry 0 is the identity.
+        condition: Vectors (x, y) in the plane of the pad come first. The scalars after them stay as they are.
+        symmetry: Number of the symmetry, 0 to 7.
         vectors: Number of vectors at the beginning of the condition.
     """
     if condition.shape[-1] == 0:
