@@ -4,7 +4,7 @@
     python -m benchmarks.recording --folder /mnt    # on another disk
 
 The command writes pairs of a visual and a tactile image as `hardware.Session` does. The folder of a pair contains both
-images as PNG files and the checksums of the files, and is flushed to the disk. The images are synthetic and smooth,
+images as PNG files and their manifest, and is flushed to the disk. The images are synthetic and smooth,
 without noise or with noise of standard deviation 1.5 (of 255). For two image sizes, each without and with noise, the
 command prints the size of the files of a pair, the median time of encoding, the median time of writing, and the longest
 time of encoding and writing together. The command deletes the files afterwards.
@@ -21,7 +21,7 @@ import numpy as np
 import tyro
 
 from sts_jax import storage
-from sts_jax.hardware import Lit, Pair, Shot, recordings
+from sts_jax.hardware import Lit, Pair, Shot, proof, session
 
 SIZES = ((640, 480), (1640, 1232))
 
@@ -41,7 +41,7 @@ def pair(random: np.random.Generator, width: int, height: int, noise: float) -> 
     The noise is normally distributed with the standard deviation `noise` (grey levels).
     """
 
-    def shot(stream: recordings.Stream, level: int) -> Shot:
+    def shot(stream: proof.Stream, level: int) -> Shot:
         smooth = cv2.GaussianBlur(random.uniform(0, 1, (height, width, 3)).astype(np.float32), (0, 0), width / 50)
         smooth = (smooth - smooth.min()) / (smooth.max() - smooth.min())
         image = np.clip(level + 120 * smooth + random.normal(0, noise, smooth.shape), 0, 255).astype(np.uint8)
@@ -62,7 +62,7 @@ def main(args: Args) -> None:
             with tempfile.TemporaryDirectory(dir=args.folder) as folder:
                 for number in range(args.pairs):
                     start = time.perf_counter()
-                    files = recordings.encoded_pair(taken, None)
+                    files = session.encoded_pair(taken)
                     middle = time.perf_counter()
                     storage.write_folder(Path(folder) / str(number), files)
                     encoding.append(1e3 * (middle - start))

@@ -105,11 +105,7 @@ def session(folder: Path, sensor: Path | None, resolution: tuple[int, int]) -> S
             return hardware.rectified(lens, pinhole, image, resolution)
 
     found = recordings.images(convert)
-    ends = (
-        np.stack([found.initial_visual, found.final_visual], 1),
-        np.stack([found.initial_tactile, found.final_tactile], 1),
-    )
-    return side(*ends, np.array(recordings.numbers), f"{folder}, {described}")
+    return side(found.visual, found.tactile, found.number, f"{folder}, {described}")
 
 
 def simulated_dataset(folder: Path, resolution: tuple[int, int] | None) -> Side:

@@ -373,14 +373,15 @@ def flush_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def write_folder(path: Path, files: dict[str, bytes]) -> None:
-    """Create a folder with files atomically. An interruption leaves either the complete folder or the previous state.
+def write_folder(path: Path, files: Mapping[str, bytes], facts: Mapping[str, Any] | None = None) -> None:
+    """Create a folder with files and a manifest atomically. An interruption leaves the folder complete or as it was.
 
     All files are on disk when the function returns.
 
     Args:
         path: The folder. A folder that already exists must be empty.
-        files: Dictionary from the name of a file to the content of the file.
+        files: Content of each file, by name.
+        facts: Facts of the manifest.
 
     Raises:
         OSError: A file cannot be written, or `path` is a file or a non-empty folder. The message names the folder and
@@ -396,6 +397,7 @@ def write_folder(path: Path, files: dict[str, bytes]) -> None:
                 file.write(data)
                 file.flush()
                 os.fsync(file.fileno())
+        write_manifest(temporary, {name: hashlib.sha256(data).hexdigest() for name, data in files.items()}, facts)
         flush_folder(temporary)
         temporary.rename(path)
         flush_folder(path.parent)

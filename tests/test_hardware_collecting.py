@@ -89,9 +89,9 @@ def test_trajectories_are_collected_discarded_and_continued(peer, sensor, tmp_pa
 def test_collecting_goes_on_while_the_disk_is_slow(peer, sensor, tmp_path, monkeypatch):
     write, reviewing = storage.write_folder, threading.Event()
 
-    def slow(path, files):
+    def slow(path, *content):
         assert reviewing.wait(60)
-        write(path, files)
+        write(path, *content)
 
     monkeypatch.setattr(storage, "write_folder", slow)
     person = Playing(Player(peer))
@@ -124,10 +124,10 @@ def test_an_interruption_by_the_keyboard_keeps_what_was_confirmed(peer, sensor, 
 def test_a_full_disk_is_shown_before_the_next_trajectory(peer, sensor, tmp_path, monkeypatch):
     write, full = storage.write_folder, threading.Event()
 
-    def write_folder(path, files):
+    def write_folder(path, *content):
         if full.is_set():
             raise OSError(errno.ENOSPC, "No space left on device")
-        write(path, files)
+        write(path, *content)
 
     monkeypatch.setattr(storage, "write_folder", write_folder)
     full.set()

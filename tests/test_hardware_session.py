@@ -2,9 +2,9 @@
 
 import dataclasses
 import errno
-import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,7 +18,6 @@ from led_simulator import until
 from session_writer import ORIGIN, pair
 
 from sts_jax import hardware, storage
-from sts_jax.hardware import recordings
 from sts_jax.hardware.proof import Settling
 from sts_jax.hardware.session import Session, SessionError
 
@@ -62,13 +61,13 @@ def test_reading_returns_what_was_saved(tmp_path):
     (trajectory,) = read
     assert_equal(trajectory.initial, saved["initial"])
     assert_equal(trajectory.final, saved["final"])
-    assert (trajectory.number, trajectory.note, len(read)) == (0, "on its edge", 1)
+    assert (trajectory.number, trajectory.note, len(read), read.origin) == (0, "on its edge", 1, ORIGIN)
     images = read.images(lambda image: image[::2])
-    np.testing.assert_array_equal(images.final_tactile[0], saved["final"].tactile.image[::2])
-    np.testing.assert_array_equal(images.initial_visual[0], saved["initial"].visual.image[::2])
-    content = json.loads((tmp_path / "trajectories/00000/initial/pair.json").read_text())
-    assert content["settling"] == dataclasses.asdict(settling)
-    assert content["visual"]["taken"].endswith("+00:00")
+    np.testing.assert_array_equal(images.tactile[0, 1], saved["final"].tactile.image[::2])
+    np.testing.assert_array_equal(images.visual[0, 0], saved["initial"].visual.image[::2])
+    facts = storage.read_manifest(tmp_path / "trajectories/00000/initial", "").facts
+    assert facts["settling"] == dataclasses.asdict(settling)
+    assert facts["visual"]["taken"].endswith("+00:00")
 
 
 def test_resuming_continues_with_the_next_number(tmp_path):
@@ -96,7 +95,7 @@ def test_discarding_and_restoring(tmp_path):
         hardware.load_recordings(tmp_path).images()
     hardware.restore_recording(tmp_path, 0)
     hardware.confirm_recording(tmp_path, 1, "later")
-    with pytest.raises(FileNotFoundError, match="has no final pair"):
+    with pytest.raises(FileNotFoundError, match="it has no final pair"):
         hardware.confirm_recording(tmp_path, 2)
     with pytest.raises(FileNotFoundError, match="list the trajectories"):
         hardware.restore_recording(tmp_path, 7)
@@ -109,65 +108,121 @@ def test_discarding_and_restoring(tmp_path):
 def test_reviewing_waits_for_the_end_of_collecting(tmp_path):
     with Session.open(tmp_path, ORIGIN) as session:
         add(session)
-        with pytest.raises(storage.LockedError, match="is in use by"):
-            hardware.discard_recording(tmp_path, 0)
-        with pytest.raises(storage.LockedError, match=r"is in use by .*: close what uses the folder in this process"):
-            Session.open(tmp_path, ORIGIN)
+        for use in (lambda: hardware.discard_recording(tmp_path, 0), lambda: Session.open(tmp_path, ORIGIN)):
+            with pytest.raises(storage.LockedError, match=r"is in use by .*: close what uses the folder"):
+                use()
 
 
-def test_a_session_of_another_sensor_is_refused(tmp_path):
-    Session.open(tmp_path, ORIGIN).close()
-    with pytest.raises(ValueError, match=r"leds = '0123', but the current settings have leds = '0124'"):
-        Session.open(tmp_path, dataclasses.replace(ORIGIN, leds="0124"))
-    Session.open(tmp_path, ORIGIN).close()  # the lock was released
-
-
-@pytest.mark.parametrize(
-    ("name", "damage"),
-    [
-        ("initial/visual.png", lambda data: data[:-20]),
-        ("final/tactile.png", lambda data: data[:100] + bytes([data[100] ^ 1]) + data[101:]),
-        ("final/pair.json", lambda data: data.replace(b"0.2", b"0.3") + b" "),
-        ("confirmed.json", lambda data: data.replace(b"note 0", b"note 1")),
-        ("confirmed.json", lambda data: data[:30]),
-        ("confirmed.json", lambda data: b"[]"),
-        ("initial/tactile.png", None),
-        ("initial/pair.json", None),
-    ],
-)
-def test_damage_is_named_with_the_remedy(tmp_path, name, damage):
-    with Session.open(tmp_path, ORIGIN) as session:
-        add(session)
-        add(session)
-    path = tmp_path / "trajectories/00000" / name
-    if damage is None:
-        path.unlink()
-    else:
-        path.write_bytes(damage(path.read_bytes()))
-    read = hardware.load_recordings(tmp_path)
-    with pytest.raises(storage.DamagedFileError, match=rf"{path.name}.*discard trajectory 0"):
-        read[0]
-    assert read[1].number == 1
-    hardware.discard_recording(tmp_path, 0)
-    assert len(list(hardware.load_recordings(tmp_path))) == 1
-
-
-def test_folders_that_are_no_session_are_named(tmp_path):
+def test_a_session_of_another_sensor_and_other_folders_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match="holds no session"):
         hardware.load_recordings(tmp_path)
-    (tmp_path / "session.json").write_text('{"format": 9}')
-    with pytest.raises(ValueError, match="has format 9, but this version of sts_jax reads format 1"):
+    Session.open(tmp_path / "session", ORIGIN).close()
+    with pytest.raises(ValueError, match=r"was recorded with leds = '0123', but this sensor has leds = '0124'"):
+        Session.open(tmp_path / "session", dataclasses.replace(ORIGIN, leds="0124"))
+    Session.open(tmp_path / "session", ORIGIN).close()  # the lock was released
+    storage.write_manifest(tmp_path, {}, {"shards": 3})
+    with pytest.raises(ValueError, match="holds no session .*origin.camera is missing"):
         hardware.list_recordings(tmp_path)
+
+
+FLIPPED = (
+    "manifest.json",
+    *(f"initial/{name}" for name in ("manifest.json", "visual.png", "tactile.png")),
+    *(f"final/{name}" for name in ("manifest.json", "visual.png", "tactile.png")),
+)
+
+
+@pytest.fixture(scope="module")
+def two_trajectories(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("session")
+    with Session.open(folder, ORIGIN) as session:
+        add(session)
+        add(session)
+    return folder
+
+
+@pytest.fixture
+def folder(two_trajectories, tmp_path):
+    return Path(shutil.copytree(two_trajectories, tmp_path / "session"))
+
+
+def refused(folder, name):
+    """The damage of trajectory 0 is found and named, the other trajectory is not affected."""
+    read = hardware.load_recordings(folder)
+    with pytest.raises(storage.DamagedFileError, match=rf"{name}.*discard trajectory 0"):
+        read[0]
+    assert read[1].number == 1
+
+
+@pytest.mark.parametrize("name", FLIPPED)
+def test_a_flipped_bit_is_found(folder, name):
+    path, random = folder / "trajectories/00000" / name, np.random.default_rng(0)
+    data = path.read_bytes()
+    for place in (0, len(data) - 2, *random.integers(0, len(data), 20)):
+        changed = bytearray(data)
+        changed[place] ^= 1 << random.integers(0, 7)
+        path.write_bytes(changed)
+        refused(folder, name)
+
+
+def test_a_flipped_bit_in_the_manifest_of_the_session_is_found(folder):
+    path = folder / "manifest.json"
+    data = path.read_bytes()
+    for place in np.random.default_rng(0).integers(0, len(data) - 1, 20):
+        path.write_bytes(data[:place] + bytes([data[place] ^ 2]) + data[place + 1 :])
+        for use in (hardware.load_recordings, hardware.list_recordings, lambda folder: Session.open(folder, ORIGIN)):
+            with pytest.raises(storage.DamagedFileError, match=r"manifest.json .*restore it from a backup"):
+                use(folder)
+
+
+@pytest.mark.parametrize("name", FLIPPED)
+def test_truncated_missing_and_exchanged_files_are_found(folder, name):
+    path, other = (folder / "trajectories" / number / name for number in ("00000", "00001"))
+    data = path.read_bytes()
+    path.write_bytes(data[:-20])
+    refused(folder, name)
+    path.write_bytes(other.read_bytes())
+    refused(folder, "trajectory 1" if name == "manifest.json" else name)
+    path.unlink()
+    if name != "manifest.json":  # without it, the trajectory is not confirmed
+        refused(folder, name)
+    path.write_bytes(data)
+    assert len(list(hardware.load_recordings(folder))) == 2
+
+
+def test_exchanged_pairs_and_trajectories_of_other_sensors_are_found(folder, tmp_path):
+    path = folder / "trajectories/00000"
+    (path / "initial").rename(path / "x")
+    (path / "final").rename(path / "initial")
+    (path / "x").rename(path / "final")
+    refused(folder, "initial/.*")
+    shutil.rmtree(path)
+    with Session.open(tmp_path / "other", dataclasses.replace(ORIGIN, leds="0124")) as session:
+        add(session)
+    shutil.copytree(tmp_path / "other/trajectories/00000", path)
+    refused(folder, "another sensor")
+    hardware.discard_recording(folder, 0)
+    assert len(list(hardware.load_recordings(folder))) == 1
+
+
+def test_damage_before_the_confirmation_is_found(tmp_path):
+    with Session.open(tmp_path, ORIGIN) as session:
+        add(session, confirm=False)
+    path = tmp_path / "trajectories/00000/final/visual.png"
+    path.write_bytes(path.read_bytes()[:-1] + b"x")
+    hardware.confirm_recording(tmp_path, 0)
+    with pytest.raises(storage.DamagedFileError, match="final/visual.png"):
+        hardware.load_recordings(tmp_path)[0]
 
 
 def test_a_full_disk_loses_nothing_and_is_reported_before_the_next_trajectory(tmp_path, monkeypatch):
     write, full = storage.write_folder, []
 
-    def write_folder(path, files):
+    def write_folder(path, *content):
         if full:
             (path.parent / ".x.partial").mkdir(parents=True, exist_ok=True)
             raise OSError(errno.ENOSPC, "No space left on device")
-        write(path, files)
+        write(path, *content)
 
     monkeypatch.setattr(storage, "write_folder", write_folder)
     with Session.open(tmp_path, ORIGIN) as session:
@@ -179,7 +234,7 @@ def test_a_full_disk_loses_nothing_and_is_reported_before_the_next_trajectory(tm
         session.confirm(number)
         until(lambda: session.problem is not None)
         assert session.confirmed == 1
-        with pytest.raises(SessionError, match=r"changes that are not on disk yet: 3\. Error: .*No space left"):
+        with pytest.raises(SessionError, match=r"3 changes are not on disk yet\. Error: .*No space left"):
             session.check_ready()
         with pytest.raises(SessionError, match=r"were not on disk after 0\.1 s.*: the initial pair of trajectory 1"):
             session.flush(0.1)
@@ -193,7 +248,7 @@ def test_a_full_disk_loses_nothing_and_is_reported_before_the_next_trajectory(tm
 
 
 def test_closing_with_a_full_disk_names_what_is_lost(tmp_path, monkeypatch):
-    def full(path, files):
+    def full(path, *content):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     session = Session.open(tmp_path, ORIGIN)
@@ -212,7 +267,7 @@ def test_closing_with_a_full_disk_names_what_is_lost(tmp_path, monkeypatch):
 def test_too_many_waiting_pairs_are_refused_and_too_little_space_is_named(tmp_path, monkeypatch):
     release = []
 
-    def slow(path, files):
+    def slow(path, *content):
         until(lambda: release)
 
     monkeypatch.setattr(storage, "write_folder", slow)
@@ -299,7 +354,7 @@ def check_killed(folder, reported):
             np.testing.assert_array_equal(found.visual.image, made.visual.image)
             np.testing.assert_array_equal(found.tactile.image, made.tactile.image)
     for folder_of_pair in folder.glob("trajectories/*/[if]*l"):  # initial and final: no half pair, confirmed or not
-        recordings.read_pair(folder_of_pair, 0)
+        storage.verify(folder_of_pair, storage.read_manifest(folder_of_pair, ""), "")
     Session.open(folder, ORIGIN).close()
     assert not list(folder.glob("trajectories/*/.*.partial"))
 

@@ -72,7 +72,8 @@ def test_an_error_of_the_writer_passes_unchanged(tmp_path):
 
 def test_a_folder_is_written_as_a_whole_or_not_at_all(tmp_path, monkeypatch):
     storage.write_folder(tmp_path / "deep" / "a", {"one": b"1", "two": b"2"})
-    assert {path.name: path.read_bytes() for path in (tmp_path / "deep/a").iterdir()} == {"one": b"1", "two": b"2"}
+    assert sorted(path.name for path in (tmp_path / "deep/a").iterdir()) == ["manifest.json", "one", "two"]
+    storage.verify(tmp_path / "deep/a", storage.read_manifest(tmp_path / "deep/a", ""), "")
     with pytest.raises(OSError, match=r"cannot write .*a: .*Remove the file or folder that is in the way"):
         storage.write_folder(tmp_path / "deep" / "a", {"one": b"3"})
     monkeypatch.setattr(os, "fsync", lambda _: (_ for _ in ()).throw(OSError(errno.ENOSPC, "No space left on device")))

@@ -76,14 +76,14 @@ def check(config: Config) -> None:
 def read(config: Config, workdir: Path) -> Recorded:
     """Read the confirmed trajectories of a work directory, rectify the images, and hold out validation trajectories.
 
-    A trajectory is confirmed if it has the file `confirmed.json`.
+    A trajectory is confirmed if it has a `manifest.json`.
 
     Args:
         config: Configuration of the experiment.
         workdir: Work directory with the folder `dataset` and the sensor file.
 
     Raises:
-        FileNotFoundError: The work directory has no `dataset/session.json`, or no sensor file.
+        FileNotFoundError: The work directory has no session in `dataset`, or no sensor file.
         ValueError: There are too few trajectories. Or the content of the sensor file is invalid, names no background
             images (images of the empty pad), or does not fit the images. Or a background image is missing or damaged.
         OSError: A file cannot be read, or is damaged.
@@ -113,7 +113,7 @@ def read(config: Config, workdir: Path) -> Recorded:
     train, validation = (
         hardware.RecordedImages(*(leaf[np.sort(rows)] for leaf in found)) for rows in (order[:cut], order[cut:])
     )
-    source = "a digital twin" if is_twin(recordings) else f"the sensor {recordings.session['camera']}"
+    source = "a digital twin" if is_twin(recordings) else f"the sensor {recordings.origin.camera}"
     return Recorded(train, validation, empty, identity(workdir, recordings), source)
 
 
@@ -122,7 +122,7 @@ def is_twin(recordings: hardware.Recordings) -> bool:
 
     The serial number of a twin's LED controller begins with TWIN.
     """
-    return str(recordings.session["leds"]).startswith("TWIN")
+    return recordings.origin.leds.startswith("TWIN")
 
 
 def missing(config: Config, workdir: Path) -> int:
@@ -132,12 +132,12 @@ def missing(config: Config, workdir: Path) -> int:
     `python -m experiments.twin` ran as a separate program.
 
     Raises:
-        OSError: `session.json` is damaged.
+        OSError: The manifest of the session is damaged.
     """
-    if not (workdir / "dataset" / hardware.recordings.SESSION).exists():
+    if not (workdir / "dataset" / storage.MANIFEST).exists():
         return config.count
     recordings = hardware.load_recordings(workdir / "dataset")
-    return max(config.count - len(recordings), 0) if recordings.session["camera"] == twin.CAMERA else 0
+    return max(config.count - len(recordings), 0) if recordings.origin.camera == twin.CAMERA else 0
 
 
 def samples(config: Config, count: int) -> int:

@@ -13,7 +13,7 @@ import jax
 import sts_jax as sts
 from experiments.shared import backgrounds
 from experiments.shared.progress import Bar, say
-from sts_jax import hardware
+from sts_jax import hardware, storage
 from sts_jax.hardware import EmptyPad, GuideConfig, View, twin
 
 OBJECT = "camera"  # class of the object. The paper releases a small camera
@@ -88,7 +88,7 @@ def collect(config: Simulated) -> None:
         OSError: A file cannot be written.
     """
     dataset = config.workdir / "dataset"
-    if (dataset / hardware.recordings.SESSION).exists() and len(hardware.load_recordings(dataset)) >= config.count:
+    if (dataset / storage.MANIFEST).exists() and len(hardware.load_recordings(dataset)) >= config.count:
         say(f"{dataset} has {config.count} trajectories already")
         return
     first = hardware.next_recording(dataset)

@@ -43,11 +43,16 @@ from sts_jax.hardware.lens import Lens, Pinhole, distorted, distortion, project,
 from sts_jax.hardware.opencv import OpenCVCamera
 from sts_jax.hardware.proof import LightError, NoContrastError, NotStillError, Pair, Settling, Shot
 from sts_jax.hardware.recorder import Recorder
-from sts_jax.hardware.recordings import (
+from sts_jax.hardware.replay import Replay
+from sts_jax.hardware.sensor_file import Background, Device, SensorFileError, WrongDeviceError
+from sts_jax.hardware.session import (
     Entry,
-    Images,
+    Origin,
+    RecordedImages,
     RecordedTrajectory,
     Recordings,
+    Session,
+    SessionError,
     confirm_recording,
     discard_recording,
     list_recordings,
@@ -55,11 +60,8 @@ from sts_jax.hardware.recordings import (
     next_recording,
     restore_recording,
 )
-from sts_jax.hardware.replay import Replay
-from sts_jax.hardware.sensor_file import Background, Device, SensorFileError, WrongDeviceError
-from sts_jax.hardware.session import Origin, Session, SessionError
 from sts_jax.hardware.sts import STS, Exposed, FoundSensors, brightness, choose_exposure, find_sensors
-from sts_jax.hardware.views import RecordedImages, SensorView, recorded_images, relit, sensor_view
+from sts_jax.hardware.views import SensorView, recorded_images, relit, sensor_view
 
 __all__ = [
     "STS",
@@ -92,7 +94,6 @@ __all__ = [
     "FrameSizeError",
     "FrozenCameraError",
     "GuideConfig",
-    "Images",
     "LedError",
     "LedTimeoutError",
     "Leds",

@@ -29,7 +29,6 @@ import cv2
 from sts_jax import storage
 from sts_jax.hardware import matroska
 from sts_jax.hardware.proof import Settling, Shot
-from sts_jax.hardware.recordings import encoded
 from sts_jax.hardware.sensor_file import Device, sensor_file
 from sts_jax.hardware.session import Origin
 
@@ -165,7 +164,7 @@ class Recorder:
     def _encoded(self, shot: Shot) -> bytes:
         """Encode the image as PNG or JPEG."""
         if self._encoding == "png":
-            return encoded(shot.image)
+            return cv2.imencode(".png", cv2.cvtColor(shot.image, cv2.COLOR_RGB2BGR))[1].tobytes()
         return cv2.imencode(".jpg", cv2.cvtColor(shot.image, cv2.COLOR_RGB2BGR), _QUALITY)[1].tobytes()
 
     def _append(self, name: str, data: bytes, head: bytes = b"") -> int:

@@ -1,37 +1,58 @@
-"""`Session`: a folder to which trajectories of the real sensor are added. A background thread writes the files."""
+"""Sessions: folders of trajectories that were recorded with one real sensor.
+
+    manifest.json                      the sensor (`Origin`)
+    trajectories/00012/initial/        the pair of the held object: visual.png, tactile.png, and a manifest.json with
+                                       the times and the proof of light
+    trajectories/00012/final/          the pair of the object at rest: the same files
+    trajectories/00012/manifest.json   written by the confirmation: number, note, and checksums of all files above
+    discarded/00013/                   a trajectory that was discarded
+
+The folder of a pair appears when all its files are on disk. A trajectory with a `manifest.json` is confirmed.
+"""
 
 import collections
 import contextlib
 import dataclasses
+import datetime
+import os
 import shutil
 import threading
+import time
 import urllib.parse
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
+from typing import Any, Literal, NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Int, UInt8
 
 from sts_jax import storage
-from sts_jax.hardware import protocol, recordings
+from sts_jax.hardware import protocol
 from sts_jax.hardware.camera import CameraConfig, device_path, stable_path
 from sts_jax.hardware.guide import End
-from sts_jax.hardware.proof import Pair, Settling
+from sts_jax.hardware.leds import Lit
+from sts_jax.hardware.proof import Pair, Settling, Shot, Stream
 from sts_jax.hardware.sts import STS
+from sts_jax.storage import MANIFEST, DamagedFileError
 
+TRAJECTORIES, DISCARDED = "trajectories", "discarded"
+_ENDS: tuple[End, End] = ("initial", "final")
+_STREAMS: tuple[Stream, Stream] = ("visual", "tactile")
+# Filters and Huffman codes only, because full deflate is slower and does not make noisy images smaller.
+_PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY)
 _JOBS_OF_TRAJECTORY = 3  # two pairs and the confirmation
 _QUEUE = 2 * _JOBS_OF_TRAJECTORY  # largest number of jobs that may wait
 _RETRY_S = 1.0  # wait after a failed attempt to write (s)
 
-
-class SessionError(OSError):
-    """Raised if a session cannot be written or cannot accept more changes. The message states cause and remedy."""
+Standing = Literal["confirmed", "unconfirmed", "incomplete", "discarded"]
+Image = UInt8[np.ndarray, "height width 3"]
 
 
 @dataclasses.dataclass(frozen=True)
 class Origin:
-    """The identity of the sensor with which a session is recorded. The session stores the identity in `session.json`.
-
-    All images of a session have the same origin.
-    """
+    """The identity of a sensor. All images of a session have the same origin."""
 
     camera: str  # path in /dev/v4l/by-id, or URL without user name, password and port
     leds: str  # serial number of the LED controller
@@ -41,15 +62,7 @@ class Origin:
 
     @classmethod
     def of(cls, sensor: STS) -> "Origin":
-        """Return the identity of a sensor: the camera, the LED controller, the image size and the LED duty cycles.
-
-        Args:
-            sensor: Connected sensor. The method reads one frame to find the image size.
-
-        Raises:
-            CameraError: The camera sends no frame.
-            CameraNotConnectedError: The sensor is not connected.
-        """
+        """The identity of a connected sensor. Reads one frame to find the image size."""
         height, width = sensor.camera.async_read().image.shape[:2]
         return cls(_name(sensor.camera.config), sensor.leds.serial_number, width, height, sensor.levels)
 
@@ -64,6 +77,275 @@ def _name(config: CameraConfig) -> str:
     return config.name
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class RecordedTrajectory:
+    """A confirmed trajectory: the raw images at its beginning and at its end."""
+
+    number: int  # number of the trajectory in its session
+    initial: Pair  # images of the held object
+    final: Pair  # images of the object at rest
+    confirmed: str  # date and time of the confirmation, ISO 8601, UTC
+    note: str  # text that was stored with the confirmation, may be empty
+
+
+class RecordedImages(NamedTuple):
+    """Initial and final images of n recorded trajectories."""
+
+    visual: UInt8[np.ndarray, "n 2 height width 3"]  # visual images, RGB. The second axis is initial, final
+    tactile: UInt8[np.ndarray, "n 2 height width 3"]  # tactile images, RGB. The second axis is initial, final
+    number: Int[np.ndarray, "n"]  # number of each trajectory in its session
+
+
+class Entry(NamedTuple):
+    """A trajectory in the result of `list_recordings`."""
+
+    number: int  # number of the trajectory in its session
+    standing: Standing  # "unconfirmed": both pairs exist. "incomplete": a pair is missing
+    taken: str | None  # date and time of the initial visual image, ISO 8601, UTC. None: there is none
+    note: str  # text that was stored with the confirmation, may be empty
+
+
+class Recordings:
+    """The confirmed trajectories of a session, as a sequence of `RecordedTrajectory`, from `load_recordings`.
+
+    Each access to a trajectory reads its files and compares their checksums. The numbers are read once, so later
+    changes of the session do not change them.
+
+    Attributes:
+        folder: Folder of the session.
+        origin: The sensor.
+        numbers: Numbers of the trajectories.
+    """
+
+    def __init__(self, folder: str | os.PathLike):
+        self.folder = Path(folder)
+        self.origin = _read_origin(self.folder)
+        self.numbers = tuple(e.number for e in list_recordings(self.folder) if e.standing == "confirmed")
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    @property
+    def identity(self) -> str:
+        """SHA-256 that changes when a trajectory is confirmed, discarded or replaced."""
+        files = {str(number): _trajectory(self.folder, number) / MANIFEST for number in self.numbers}
+        return storage.digest({number: storage.sha256(file) for number, file in files.items()})
+
+    def __getitem__(self, index: int) -> RecordedTrajectory:
+        return _read(self.folder, self.numbers[index], self.origin)
+
+    def __iter__(self) -> Iterator[RecordedTrajectory]:
+        return (self[index] for index in range(len(self)))
+
+    def images(
+        self,
+        convert: Callable[[Image], Image] = lambda image: image,
+        progress: Callable[[int, int], None] = lambda done, total: None,
+    ) -> RecordedImages:
+        """Read the images of all trajectories into arrays. 500 trajectories of 1640 x 1232 pixels need 12 GB.
+
+        Args:
+            convert: Function that is applied to each raw image, for example to rectify it. All results must have the
+                same shape.
+            progress: Called after each trajectory with the numbers of trajectories done so far and in all.
+        """
+        if not self.numbers:
+            raise ValueError(
+                f"{self.folder} has no confirmed trajectory: collect trajectories, or confirm existing ones with "
+                "`python -m experiments.real review --confirm NUMBER`."
+            )
+        visual, tactile = [], []
+        for done, trajectory in enumerate(self, 1):
+            ends = trajectory.initial, trajectory.final
+            visual.append([convert(pair.visual.image) for pair in ends])
+            tactile.append([convert(pair.tactile.image) for pair in ends])
+            progress(done, len(self))
+        return RecordedImages(np.array(visual), np.array(tactile), np.array(self.numbers))
+
+    def __repr__(self) -> str:
+        return f"Recordings({str(self.folder)!r}, {len(self)} trajectories)"
+
+
+def load_recordings(folder: str | os.PathLike) -> Recordings:
+    """The confirmed trajectories of the session in a folder. Another process may add trajectories meanwhile."""
+    return Recordings(folder)
+
+
+def list_recordings(folder: str | os.PathLike) -> list[Entry]:
+    """List all trajectories of a session, unconfirmed and discarded ones included, ordered by number."""
+    _read_origin(Path(folder))
+    entries = [_entry(path, number, discarded=kind == DISCARDED) for kind, number, path in _numbered(Path(folder))]
+    return sorted(entries, key=lambda entry: entry.number)
+
+
+def next_recording(folder: str | os.PathLike) -> int:
+    """The number of a session's next trajectory: the highest number plus 1, or 0 without trajectories."""
+    return max((number for _, number, _ in _numbered(Path(folder))), default=-1) + 1
+
+
+def confirm_recording(folder: str | os.PathLike, number: int, note: str = "") -> None:
+    """Confirm a trajectory, so that `load_recordings` includes it. The session must not be open."""
+    with _locked(folder) as session:
+        _confirm(session, number, note)
+
+
+def discard_recording(folder: str | os.PathLike, number: int) -> None:
+    """Move a trajectory to the folder `discarded`, so that `load_recordings` leaves it out. Nothing is deleted."""
+    with _locked(folder) as session:
+        _move(_trajectory(session, number), _trajectory(session, number, DISCARDED))
+
+
+def restore_recording(folder: str | os.PathLike, number: int) -> None:
+    """Restore a discarded trajectory. If it was confirmed before it was discarded, it is confirmed again."""
+    with _locked(folder) as session:
+        _move(_trajectory(session, number, DISCARDED), _trajectory(session, number))
+
+
+@contextlib.contextmanager
+def _locked(folder: str | os.PathLike) -> Iterator[Path]:
+    """Check that a folder is a session, and lock it."""
+    path = Path(folder)
+    _read_origin(path)
+    with storage.lock(path):
+        yield path
+
+
+def _read_origin(folder: Path) -> Origin:
+    manifest = storage.read_manifest(folder, "restore it from a backup")
+    if manifest is None:
+        raise FileNotFoundError(f"{folder} holds no session ({MANIFEST} is missing): give the folder of a session.")
+    try:
+        return storage.decode(Origin, manifest.facts, "origin")
+    except ValueError as error:
+        raise ValueError(f"{folder} holds no session ({error}): give the folder of a session.") from error
+
+
+def _trajectory(folder: Path, number: int, kind: str = TRAJECTORIES) -> Path:
+    return folder / kind / f"{number:05d}"
+
+
+def _numbered(folder: Path) -> Iterator[tuple[str, int, Path]]:
+    """The kind ("trajectories" or "discarded"), the number and the folder of each trajectory."""
+    for kind in (TRAJECTORIES, DISCARDED):
+        for path in (folder / kind).glob("[0-9]*"):
+            if path.name.isdecimal() and path.is_dir():
+                yield kind, int(path.name), path
+
+
+def _entry(path: Path, number: int, *, discarded: bool) -> Entry:
+    taken, note = None, ""
+    with contextlib.suppress(OSError):  # reading the trajectory later raises an error that names a damaged file
+        if (initial := storage.read_manifest(path / "initial", "")) is not None:
+            taken = initial.facts["visual"]["taken"]
+        if (confirmation := storage.read_manifest(path, "")) is not None:
+            note = confirmation.facts["note"]
+    standing: Standing = "discarded"
+    if not discarded:
+        complete = all((path / end).exists() for end in _ENDS)
+        standing = "confirmed" if (path / MANIFEST).exists() else "unconfirmed" if complete else "incomplete"
+    return Entry(number, standing, taken, note)
+
+
+def _move(source: Path, target: Path) -> None:
+    if not source.is_dir():
+        raise FileNotFoundError(
+            f"trajectory folder {source} does not exist: list the trajectories with list_recordings()."
+        )
+    if target.exists():
+        raise FileExistsError(f"{source} cannot be moved to {target}, which exists already: remove one of the two.")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    source.rename(target)
+    for path in (target.parent, source.parent):
+        storage.flush_folder(path)
+
+
+def shot_facts(shot: Shot) -> dict[str, Any]:
+    """The JSON values of an image: its times, its number, and the proof of light."""
+    taken_s = time.time() - (time.monotonic() - shot.time_s)
+    return {
+        "taken": datetime.datetime.fromtimestamp(taken_s, datetime.UTC).isoformat(timespec="milliseconds"),
+        "time_s": shot.time_s,
+        "sequence": shot.sequence,
+        "epoch": shot.epoch,
+        "before": dataclasses.asdict(shot.before),
+        "until_s": shot.until_s,
+    }
+
+
+def shot_of(image: Image, stream: Stream, facts: dict[str, Any]) -> Shot:
+    """The image with the values that `shot_facts` returned."""
+    before = storage.decode(Lit, facts["before"], "before")
+    return Shot(image, stream, facts["time_s"], facts["sequence"], facts["epoch"], before, facts["until_s"])
+
+
+def encoded_pair(pair: Pair) -> dict[str, bytes]:
+    """Encode the images of a pair as `visual.png` and `tactile.png`."""
+    files = {}
+    for shot in (pair.visual, pair.tactile):
+        done, data = cv2.imencode(".png", cv2.cvtColor(shot.image, cv2.COLOR_RGB2BGR), _PNG)
+        assert done
+        files[f"{shot.stream}.png"] = data.tobytes()
+    return files
+
+
+def _confirm(folder: Path, number: int, note: str) -> None:
+    """Write the manifest of a trajectory. The session must be locked."""
+    path = _trajectory(folder, number)
+    files = {}
+    for end in _ENDS:
+        pair = storage.read_manifest(path / end, _remedy(number))
+        if pair is None:
+            raise FileNotFoundError(
+                f"trajectory {number} cannot be confirmed, because it has no {end} pair of images ({path / end}): "
+                "discard it, or give the number of another trajectory."
+            )
+        # The checksums from the time when the images were written, so that later damage is found.
+        files.update({f"{end}/{name}": checksum for name, checksum in pair.files.items()})
+    files.update(storage.checksums(path, [f"{end}/{MANIFEST}" for end in _ENDS]))
+    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
+    origin = storage.digest(dataclasses.asdict(_read_origin(folder)))
+    storage.write_manifest(path, files, {"number": number, "origin": origin, "confirmed": now, "note": note})
+    storage.flush_folder(path)
+
+
+def _read(folder: Path, number: int, origin: Origin) -> RecordedTrajectory:
+    """Read a confirmed trajectory, and compare the checksums of its files."""
+    path = _trajectory(folder, number)
+    manifest = storage.read_manifest(path, _remedy(number))
+    if manifest is None:
+        raise FileNotFoundError(
+            f"{folder} has no confirmed trajectory {number}: list the trajectories with list_recordings()."
+        )
+    facts = manifest.facts
+    if (facts.get("number"), facts.get("origin")) != (number, storage.digest(dataclasses.asdict(origin))):
+        raise DamagedFileError(
+            f"{path} belongs to trajectory {facts.get('number')} or to a session of another sensor: move it back, or "
+            f"discard trajectory {number} with discard_recording()."
+        )
+    storage.verify(path, manifest, _remedy(number))
+    initial, final = (_read_pair(path / end, number) for end in _ENDS)
+    return RecordedTrajectory(number, initial, final, facts["confirmed"], facts["note"])
+
+
+def _read_pair(path: Path, number: int) -> Pair:
+    manifest = storage.read_manifest(path, _remedy(number))
+    assert manifest is not None  # the manifest of the trajectory lists it
+    shots = []
+    for stream in _STREAMS:
+        image = cv2.cvtColor(cv2.imread(str(path / f"{stream}.png"), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+        image.flags.writeable = False
+        shots.append(shot_of(image, stream, manifest.facts[stream]))
+    return Pair(*shots)
+
+
+def _remedy(number: int) -> str:
+    return f"restore the file from a backup, or discard trajectory {number} with discard_recording()"
+
+
+class SessionError(OSError):
+    """Raised if a session cannot be written or cannot accept more changes. The message states cause and remedy."""
+
+
 @dataclasses.dataclass(frozen=True)
 class _Job:
     """A change of the session that the background thread writes to disk."""
@@ -76,10 +358,6 @@ class _Job:
 class Session:
     """A folder to which trajectories are added.
 
-    A trajectory consists of an initial pair of images, in which an object is held on the pad, and a final pair, in
-    which the released object is at rest. Each pair consists of a visual image, taken with the lights off, and a tactile
-    image, taken with the lights on.
-
     ```python
     with Session.open("runs/real/dataset", Origin.of(sensor)) as session:
         session.check_ready()
@@ -91,25 +369,18 @@ class Session:
         session.flush()  # optional, `close` does it too
     ```
 
-    A background thread writes the files, so `save` and `confirm` return at once. The property `confirmed` counts
-    only trajectories that are on disk. These trajectories survive a loss of power. If writing fails, for example
-    because the disk is full, the thread tries again every second, and `problem` describes the error.
-
-    Changes (pairs of images, confirmations and discards) wait in memory until they are on disk. At most 6 changes can
-    wait, which is enough for two trajectories. If 6 changes wait, `save`, `confirm` and `discard` raise a
-    `SessionError`. To avoid this error, call `check_ready` before each trajectory. It raises a `SessionError` unless
-    the session can accept all changes of the trajectory.
+    A background thread writes the files, so `save`, `confirm` and `discard` return at once. If writing fails, for
+    example because the disk is full, the thread tries again every second, and `problem` describes the error. At most
+    6 changes wait in memory, which is enough for two trajectories. Further ones raise a `SessionError`, which
+    `check_ready` before each trajectory avoids.
     """
 
-    def __init__(self, folder: Path, lock: contextlib.ExitStack, settling: Settling | None):
-        """Do not call this constructor. Use `Session.open` instead."""
+    def __init__(self, folder: Path, lock: contextlib.ExitStack, origin: Origin, settling: Settling | None):
         self.folder = folder
         self._lock, self._settling = lock, settling
-        self._next = recordings.next_recording(folder)
-        entries = recordings.list_recordings(folder)
-        self._confirmed = {entry.number for entry in entries if entry.standing == "confirmed"}
-        content = recordings.read_session(folder)
-        self._raw_bytes = 4 * 3 * content["width"] * content["height"]  # uncompressed size of a trajectory's images
+        self._next = next_recording(folder)
+        self._confirmed = {entry.number for entry in list_recordings(folder) if entry.standing == "confirmed"}
+        self._raw_bytes = 4 * 3 * origin.width * origin.height  # uncompressed size of a trajectory's images
         self._changed = threading.Condition()
         self._saved: set[tuple[int, End]] = set()  # pairs that were accepted
         self._jobs: collections.deque[_Job] = collections.deque()  # the first one is being written
@@ -120,42 +391,37 @@ class Session:
 
     @classmethod
     def open(cls, folder: str | Path, origin: Origin, *, settling: Settling | None = None) -> "Session":
-        """Start a new session, or continue an existing one.
+        """Start a new session, or continue an existing one. The folder is locked until `close`.
 
         Args:
-            folder: Folder of the session. The folder is locked until `close`.
+            folder: Folder of the session.
             origin: Identity of the sensor. An existing session must have the same origin.
-            settling: Settling times of the sensor's lights. The times are stored with each pair of images. None:
-                not stored.
-
-        Returns:
-            The open session. Its next trajectory gets the largest existing number plus 1, or 0 if there are no
-            trajectories. The numbers of discarded trajectories count as existing.
-
-        Raises:
-            LockedError: Another process or another open session is using the folder.
-            ValueError: The existing session has another origin. The message contains the differing values.
-            DamagedFileError: `session.json` is damaged.
-            OSError: The folder cannot be written to.
+            settling: Settling times of the lights, which are stored with each pair. None: not stored.
         """
         folder = Path(folder)
         with contextlib.ExitStack() as stack:
             stack.enter_context(storage.lock(folder))
-            storage.claim(
-                folder / recordings.SESSION,
-                {"format": recordings.FORMAT, **dataclasses.asdict(origin)},
-            )
-            for kind in (recordings.TRAJECTORIES, recordings.DISCARDED):
+            if not (folder / MANIFEST).exists():
+                storage.write_manifest(folder, {}, dataclasses.asdict(origin))
+            recorded = dataclasses.asdict(_read_origin(folder))
+            changes = {name: value for name, value in dataclasses.asdict(origin).items() if value != recorded[name]}
+            if changes:
+                raise ValueError(
+                    f"{folder} was recorded with {', '.join(f'{name} = {recorded[name]!r}' for name in changes)}, but "
+                    f"this sensor has {', '.join(f'{name} = {value!r}' for name, value in changes.items())}: choose "
+                    "another folder."
+                )
+            for kind in (TRAJECTORIES, DISCARDED):
                 (folder / kind).mkdir(exist_ok=True)
             # A process that was killed leaves partial files.
-            for rest in (*folder.glob(".*.partial"), *folder.glob(f"{recordings.TRAJECTORIES}/*/.*.partial")):
-                shutil.rmtree(rest, ignore_errors=True) if rest.is_dir() else rest.unlink(missing_ok=True)
+            for rest in (*folder.glob(".*.partial"), *folder.glob(f"{TRAJECTORIES}/*/.*.partial")):
+                shutil.rmtree(rest) if rest.is_dir() else rest.unlink()
             storage.flush_folder(folder)
-            return cls(folder, stack.pop_all(), settling)
+            return cls(folder, stack.pop_all(), origin, settling)
 
     @property
     def confirmed(self) -> int:
-        """Number of confirmed trajectories that are on disk. Discarded trajectories do not count."""
+        """Number of confirmed trajectories that are on disk and survive a loss of power."""
         with self._changed:
             return len(self._confirmed)
 
@@ -174,22 +440,15 @@ class Session:
             return f"{str(self._error).rstrip('.')}. The session tries to write again every second."
 
     def check_ready(self) -> None:
-        """Raise an error unless the session can accept a whole trajectory now.
-
-        Raises:
-            SessionError: The last attempt to write failed, or more than 3 changes (image pairs, confirmations and
-                discards) are not on disk yet, or the disk has too little free space.
-        """
+        """Raise a `SessionError` unless the session can accept a whole trajectory now."""
         if (problem := self.problem) is not None:
             raise SessionError(
-                "cannot start a new trajectory, because the last attempt to write failed. Number of changes that are "
-                f"not on disk yet: {self.waiting}. Error: {problem}"
+                f"cannot start a new trajectory, because {self.waiting} changes are not on disk yet. Error: {problem}"
             )
         if (waiting := self.waiting) > _QUEUE - _JOBS_OF_TRAJECTORY:
             raise SessionError(
-                f"cannot start a new trajectory, because the disk is too slow: {waiting} changes are not on disk yet, "
-                f"but at most {_QUEUE - _JOBS_OF_TRAJECTORY} are allowed. Wait until they are written, for example "
-                "with flush()."
+                f"cannot start a new trajectory, because the disk is too slow: {waiting} changes are not on disk yet. "
+                "Wait until they are written, for example with flush()."
             )
         free = shutil.disk_usage(self.folder).free
         if free < self._raw_bytes * 2:  # for the new trajectory and for one that may wait
@@ -199,7 +458,7 @@ class Session:
             )
 
     def begin(self) -> int:
-        """Reserve a number for a new trajectory and return it."""
+        """Reserve a number for a new trajectory and return it. Numbers are never used twice."""
         number, self._next = self._next, self._next + 1
         return number
 
@@ -208,19 +467,16 @@ class Session:
 
         Args:
             number: Number of the trajectory, from `begin`.
-            end: "initial" if the images show the object while it is held, "final" if they show the object at rest after
-                its release.
-            pair: The visual and the tactile image.
-
-        Raises:
-            SessionError: The session is closed, or its queue is full because 6 changes (image pairs, confirmations and
-                discards) are not on disk yet. The pair will not be written.
+            end: "initial" for the held object, "final" for the object at rest.
+            pair: The images.
         """
-        folder = recordings.trajectory_folder(self.folder, number)
+        folder = _trajectory(self.folder, number)
+        facts = {shot.stream: shot_facts(shot) for shot in (pair.visual, pair.tactile)}
+        settling = None if self._settling is None else dataclasses.asdict(self._settling)
 
         def write() -> None:
             if not (folder / end).exists():
-                storage.write_folder(folder / end, recordings.encoded_pair(pair, self._settling))
+                storage.write_folder(folder / end, encoded_pair(pair), {**facts, "settling": settling})
             storage.flush_folder(folder)
             storage.flush_folder(folder.parent)
 
@@ -228,56 +484,33 @@ class Session:
         self._saved.add((number, end))
 
     def confirm(self, number: int, note: str = "") -> None:
-        """Confirm a trajectory in the background. `load_recordings` reads only confirmed trajectories.
+        """Confirm a trajectory in the background, after both of its pairs were saved.
 
         Args:
-            number: Number of the trajectory, from `begin`. The initial and the final image pair of this trajectory must
-                have been passed to `save`.
+            number: Number of the trajectory.
             note: Text that is stored with the trajectory.
-
-        Raises:
-            SessionError: The session is closed, or its queue is full because 6 changes (image pairs, confirmations and
-                discards) are not on disk yet. In both cases, the trajectory is not confirmed.
-            ValueError: The initial or the final image pair of the trajectory was not passed to `save` of this
-                `Session`.
         """
-        ends: tuple[End, End] = ("initial", "final")
-        if missing := [end for end in ends if (number, end) not in self._saved]:
+        if missing := [end for end in _ENDS if (number, end) not in self._saved]:
             raise ValueError(
                 f"trajectory {number} cannot be confirmed yet: call save() with the {' and the '.join(missing)} image "
                 "pair of this trajectory before confirm()"
             )
-        write = lambda: recordings.confirm_trajectory(self.folder, number, note)  # noqa: E731
+        write = lambda: _confirm(self.folder, number, note)  # noqa: E731
         self._add(_Job(f"the confirmation of trajectory {number}", write, number))
 
     def discard(self, number: int) -> None:
-        """Move a trajectory to the folder `discarded`, in a background thread. Nothing is deleted.
-
-        Args:
-            number: Number of the trajectory. If no image pair of this trajectory was saved, nothing happens.
-
-        Raises:
-            SessionError: The session is closed, or its queue is full because 6 changes (image pairs, confirmations and
-                discards) are not on disk yet. The trajectory is not discarded.
-        """
+        """Move a trajectory to the folder `discarded`, in the background. Nothing is deleted."""
 
         def move() -> None:
-            with contextlib.suppress(FileNotFoundError):
-                recordings.discard_trajectory(self.folder, number)
+            with contextlib.suppress(FileNotFoundError):  # no pair of it was saved
+                _move(_trajectory(self.folder, number), _trajectory(self.folder, number, DISCARDED))
             with self._changed:
                 self._confirmed.discard(number)
 
-        self._add(_Job(f"the move of trajectory {number} to {recordings.DISCARDED}", move))
+        self._add(_Job(f"the move of trajectory {number} to {DISCARDED}", move))
 
     def flush(self, timeout_s: float = 30.0) -> None:
-        """Wait until all changes are on disk.
-
-        Args:
-            timeout_s: Longest wait (s).
-
-        Raises:
-            SessionError: After `timeout_s`, some changes are not on disk. The message lists them and gives the cause.
-        """
+        """Wait until all changes are on disk. After `timeout_s`, a `SessionError` lists those that are not."""
         with self._changed:
             if self._changed.wait_for(lambda: not self._jobs, timeout_s):
                 return
@@ -289,15 +522,7 @@ class Session:
         )
 
     def close(self, timeout_s: float = 30.0) -> None:
-        """Wait until all changes are on disk, end the background thread, and unlock the folder.
-
-        Args:
-            timeout_s: Longest wait for the changes (s).
-
-        Raises:
-            SessionError: After `timeout_s`, some changes are not on disk. They are lost. The message lists them and
-                gives the cause.
-        """
+        """Wait as `flush` does, end the background thread, and unlock the folder."""
         try:
             self.flush(timeout_s)
         finally:

@@ -4,12 +4,10 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 
 from sts_jax.hardware.lens import Lens, Pinhole, rectified
-from sts_jax.hardware.recordings import Recordings
-
-Progress = Callable[[int, int], None]  # called with the number of trajectories done so far, and the number of all
+from sts_jax.hardware.session import RecordedImages, Recordings
 
 
 class SensorView(NamedTuple):
@@ -17,14 +15,6 @@ class SensorView(NamedTuple):
 
     visual: Float[np.ndarray, "height width 3"]  # visual image, RGB, float32 in [0, 1]
     tactile: Float[np.ndarray, "height width 3"]  # tactile image, RGB, float32 in [0, 1]
-
-
-class RecordedImages(NamedTuple):
-    """Rectified initial and final images of n recorded trajectories."""
-
-    visual: UInt8[np.ndarray, "n 2 height width 3"]  # visual images, RGB. The second axis is initial, final
-    tactile: UInt8[np.ndarray, "n 2 height width 3"]  # tactile images, RGB. The second axis is initial, final
-    number: Int[np.ndarray, "n"]  # number of each trajectory in its session
 
 
 def sensor_view(
@@ -97,7 +87,7 @@ def recorded_images(
     pinhole: Pinhole,
     resolution: tuple[int, int] = (64, 64),
     *,
-    progress: Progress | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> RecordedImages:
     """Read and rectify the initial and final images of all recorded trajectories that the user has confirmed.
 
@@ -120,23 +110,11 @@ def recorded_images(
             `Lens.largest_angle`.
         DamagedFileError: A file is missing or damaged.
     """
-    width, height = recordings.session["width"], recordings.session["height"]
+    width, height = recordings.origin.width, recordings.origin.height
     if (width, height) != (lens.width, lens.height):
         raise ValueError(
             f"{recordings.folder} has images of {width}x{height} pixels, but the lens belongs to images of "
             f"{lens.width}x{lens.height} pixels: use the lens from the sensor file of the device that took the "
             "images in this folder"
         )
-    if not len(recordings):
-        raise ValueError(
-            f"{recordings.folder} has no confirmed trajectory: collect trajectories, or confirm existing ones with "
-            "`python -m experiments.real review --confirm NUMBER`"
-        )
-    visual, tactile = [], []
-    for done, trajectory in enumerate(recordings, 1):
-        ends = trajectory.initial, trajectory.final
-        visual.append([rectified(lens, pinhole, pair.visual.image, resolution) for pair in ends])
-        tactile.append([rectified(lens, pinhole, pair.tactile.image, resolution) for pair in ends])
-        if progress is not None:
-            progress(done, len(recordings))
-    return RecordedImages(np.array(visual), np.array(tactile), np.array(recordings.numbers))
+    return recordings.images(lambda image: rectified(lens, pinhole, image, resolution), progress)
