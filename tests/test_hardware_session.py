@@ -121,7 +121,7 @@ def test_a_session_of_another_sensor_and_other_folders_are_refused(tmp_path):
         Session.open(tmp_path / "session", dataclasses.replace(ORIGIN, leds="0124"))
     Session.open(tmp_path / "session", ORIGIN).close()  # the lock was released
     storage.write_manifest(tmp_path, {}, {"shards": 3})
-    with pytest.raises(ValueError, match="holds no session .*origin.camera is missing"):
+    with pytest.raises(ValueError, match=r"holds no session .*origin.camera is missing"):
         hardware.list_recordings(tmp_path)
 
 
@@ -211,7 +211,7 @@ def test_damage_before_the_confirmation_is_found(tmp_path):
     path = tmp_path / "trajectories/00000/final/visual.png"
     path.write_bytes(path.read_bytes()[:-1] + b"x")
     hardware.confirm_recording(tmp_path, 0)
-    with pytest.raises(storage.DamagedFileError, match="final/visual.png"):
+    with pytest.raises(storage.DamagedFileError, match=r"final/visual\.png"):
         hardware.load_recordings(tmp_path)[0]
 
 

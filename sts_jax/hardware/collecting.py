@@ -1,13 +1,9 @@
-"""`collect`: the loop that reads a sensor, instructs a person, and saves trajectories in the folder of a session.
-
-A trajectory consists of two pairs of images. A pair is a visual and a tactile image. The first pair shows an object
-that a person holds on the pad. The second pair shows the same object at rest after its release.
-"""
+"""`collect`: the loop that reads a sensor, instructs a person, and saves trajectories in a session."""
 
 import dataclasses
 import enum
 import time
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 from sts_jax.hardware import guide
 from sts_jax.hardware.camera import CameraLostError, CameraTimeoutError, FrozenCameraError, StaleFrameError
@@ -28,11 +24,7 @@ _PASSING = (
 
 
 class Action(enum.Enum):
-    """An action of the person who collects trajectories with `collect`.
-
-    A trajectory consists of two pairs of images. A pair is a visual and a tactile image. The first pair shows a held
-    object. The second pair shows the same object after its release.
-    """
+    """An action of the person."""
 
     CONFIRM = "confirm"  # confirm the current stage: the pad is empty, the object is released, the trajectory is good
     DISCARD = "discard"  # discard the current trajectory
@@ -41,7 +33,7 @@ class Action(enum.Enum):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class View:
-    """The information that `collect` shows to the person who moves the objects."""
+    """What `collect` shows to the person."""
 
     pair: Pair | None  # newest pair of images, None: there is none yet
     stage: Stage  # current stage of the guide
@@ -56,50 +48,38 @@ class View:
     final: Pair | None  # final pair of the current trajectory, None: not taken yet
 
 
-@runtime_checkable
 class PairReader(Protocol):
-    """A sensor that returns pairs of a visual and a tactile image, such as `STS` or the simulated `VirtualSensor`."""
+    """A sensor, such as `STS`, `Replay` or `twin.VirtualSensor`."""
 
     def read(self) -> Pair:
         """Return a new visual and a new tactile image. Both arrive after the beginning of the call."""
 
 
-@runtime_checkable
 class Person(Protocol):
-    """The interface, such as a web page or a terminal, between `collect` and the person who moves the objects.
+    """The interface to the person, such as a web page or a terminal.
 
     Each method must return immediately, because `collect` reads no images until the method returns.
     """
 
     def show(self, view: View) -> None:
-        """Show the newest images, the instruction and the state of the recording to the person.
-
-        `collect` calls this method after each attempt to read a visual and a tactile image.
-        """
+        """Show the newest images and the instruction. `collect` calls this after each attempt to read a pair."""
 
     def action(self) -> Action | None:
-        """Return the next action of the person, or None if there is none.
-
-        The action refers to the `View` that was last passed to `show`.
-        """
+        """The next action, which refers to the `View` that was last passed to `show`. None: there is none."""
 
 
 class AutomaticPerson:
-    """A `Person` that confirms every recorded trajectory automatically. Another program must move the objects."""
+    """A `Person` that confirms every recorded trajectory. Another program must move the objects."""
 
     def __init__(self) -> None:
-        """Begin in the stage `CLEAR`, in which everything is taken off the pad."""
         self._stage = Stage.CLEAR
 
     def show(self, view: View) -> None:
-        """Store `view.stage`, because the result of `action` depends on it."""
+        """Store the stage, on which the action depends."""
         self._stage = view.stage
 
     def action(self) -> Action | None:
-        """Return `Action.CONFIRM` if the latest view that `show` received has the stage `REVIEW`, otherwise None.
-
-        In the stage `REVIEW`, a recorded trajectory is confirmed or discarded.
-        """
+        """Confirm in the stage `REVIEW`, otherwise None."""
         return Action.CONFIRM if self._stage is Stage.REVIEW else None
 
 
@@ -117,33 +97,22 @@ def collect(
 ) -> int:
     """Collect trajectories until the person stops, or until the session has enough of them.
 
-    A trajectory consists of two pairs of images. A pair is a visual and a tactile image. The first pair shows an object
-    that a person holds on the pad. The second pair shows the same object at rest after its release. A state machine,
-    the guide, evaluates the images. The guide chooses the instruction for the person, and decides when each pair is
-    saved. At the end of each trajectory, the person confirms or discards it.
-
     Args:
         sensor: Connected sensor.
         session: Session in which the trajectories are saved. `collect` does not close it.
-        person: Interface that shows the instructions and returns the person's actions.
+        person: Interface to the person.
         config: Thresholds and times of the guide. None: the defaults of `GuideConfig`.
         empty: Appearance of the empty pad, from `known_pad`. None: the empty pad is measured at the beginning.
         trusted: True if the pad is certainly empty at the beginning. If False and `empty` is None, the person has to
             confirm that the pad is empty.
-        count: Largest number of confirmed trajectories in the session, including those of earlier calls. Collecting
-            ends when the session has this number. None: no limit.
+        count: Number of confirmed trajectories in the session, earlier ones included, at which collecting ends. None:
+            no limit.
         note: Text that is stored with each trajectory.
-        patience_s: Longest time without images (s). If `sensor.read` fails with a temporary error, the person sees the
-            error, and `collect` tries again for up to this time. Collecting continues if a lost camera or LED
-            controller is found again.
+        patience_s: Longest time without images (s), for example while the camera is unplugged. The person sees the
+            error, and `collect` tries again.
 
     Returns:
         Number of trajectories that were confirmed during this call.
-
-    Raises:
-        LightError, LedError, CameraError: `sensor.read` failed for longer than `patience_s`, or with an error that is
-            not temporary.
-        SessionError: Images or confirmations cannot be written to disk, or too many of them wait to be written.
     """
     return _Collecting(sensor, session, person, config or GuideConfig(), note).run(
         guide.start(empty, trusted=trusted), count, patience_s
@@ -162,7 +131,6 @@ class _Collecting:
         self._confirmed = 0  # trajectories that were confirmed in this loop
 
     def run(self, state: guide.State, count: int | None, patience_s: float) -> int:
-        """Run the loop, and return the number of trajectories that were confirmed in it."""
         before = self._session.confirmed
         failing_since: float | None = None
         while count is None or before + self._confirmed < count:
@@ -190,7 +158,6 @@ class _Collecting:
         return self._confirmed
 
     def _not_ready(self, state: guide.State) -> str | None:
-        """The error of the session that prevents a new trajectory, or None."""
         if state.stage not in (Stage.CLEAR, Stage.PLACE):
             return None
         try:
@@ -214,7 +181,6 @@ class _Collecting:
         return state
 
     def _acted(self, state: guide.State, action: Action) -> guide.State:
-        """Apply the person's action to the session and to the guide."""
         if action is Action.CONFIRM:
             if state.stage is Stage.REVIEW and self._number is not None:
                 self._session.confirm(self._number, self._note)
@@ -227,7 +193,6 @@ class _Collecting:
         return guide.discard(state)
 
     def _forget(self) -> None:
-        """End the current trajectory, which was confirmed, discarded or not begun."""
         self._number, self._ends = None, {}
 
     def _view(self, state: guide.State, problem: str | None) -> View:

@@ -1,18 +1,9 @@
-"""The guide leads a person through the stages of recording a trajectory, and derives the current stage from images.
+"""The guide: a state machine that leads a person through the stages of a trajectory, as a pure function of images.
 
-The guide is a pure function of a state and a pair of images (one visual, one tactile), and needs no devices. The person
-places an object on the pad and holds it (stages `PLACE` and `HOLD`), releases it (`RELEASE`), and waits until it rests
-(`STILL`).
-
-The guide compares the mean colours of blocks of pixels, because the noise of single pixels averages out in them:
-
-- A movement is a change of a block's mean colour between two images. For this purpose, each image is divided into 24
-  rows of 32 blocks.
-- A contact is a difference between the mean colours of a block in the current tactile image and in a tactile image of
-  the empty pad. For this purpose, the images are divided into 48 rows of 64 blocks, because a contact can be small.
-
-Changes and differences count only if they exceed a threshold. The threshold is a multiple of the noise of the mean
-colour, but at least 3 and at most 24 of 255.
+A movement is a change of the mean colour of a block (24 rows of 32) between two images. A contact is a difference
+between the mean colours of a small block (48 rows of 64, because a contact can be small) in the tactile image and in a
+tactile image of the empty pad. Means are compared, because the noise of single pixels averages out in them. A change
+counts if it exceeds a multiple of the noise of the mean, but at least 3 and at most 24 of 255.
 """
 
 import dataclasses
@@ -27,6 +18,7 @@ from jaxtyping import Float, UInt8
 
 from sts_jax.hardware.proof import thumbnail
 
+Image = UInt8[np.ndarray, "height width 3"]
 Blocks = Float[np.ndarray, "24 32 3"]  # means of an image's blocks, 0 to 255
 SmallBlocks = Float[np.ndarray, "48 64 3"]  # means of blocks of half the width and height, 0 to 255
 End = Literal["initial", "final"]  # "initial": the pair of the held object, "final": the pair of the object at rest
@@ -37,7 +29,7 @@ _KEPT = 16  # number of earlier observations that are kept in `State.window` bes
 
 
 class Stage(enum.Enum):
-    """The stages of recording one trajectory. Each stage is an instruction for the person who moves the object."""
+    """The stages of recording one trajectory. Each stage is an instruction for the person."""
 
     CLEAR = "clear"  # take everything off the pad
     PLACE = "place"  # place the object on the pad
@@ -49,13 +41,7 @@ class Stage(enum.Enum):
 
 @dataclasses.dataclass(frozen=True)
 class GuideConfig:
-    """Thresholds and times of the guide.
-
-    The guide is the state machine that leads a person through the recording of trajectories.
-
-    Raises:
-        ValueError: A field is out of range.
-    """
+    """Thresholds and times of the guide."""
 
     deviations: float = 6.0  # threshold of a block's change, in standard deviations of the noise of the block's mean
     smallest_change: float = 3.0  # lower limit of the threshold of a block's change, of 255
@@ -73,8 +59,6 @@ class GuideConfig:
             value = getattr(self, field.name)
             if field.name != "watched" and not (value > 0 and math.isfinite(value)):
                 raise ValueError(f"{field.name} must be > 0 and finite, got {value}")
-        if self.watched not in ("both", "tactile"):
-            raise ValueError(f"watched must be 'both' or 'tactile', got {self.watched!r}")
         if self.pairs < 3:  # the pair that is saved needs a pair before it and a pair after it
             raise ValueError(f"pairs must be >= 3, got {self.pairs}")
         if self.largest_threshold < self.smallest_change:
@@ -85,120 +69,62 @@ class GuideConfig:
 
 
 class Observation(NamedTuple):
-    """The mean colours of the blocks of a visual and a tactile image.
-
-    Each image is divided into 24 rows of 32 blocks, and the tactile image also into 48 rows of 64 small blocks. A block
-    mean is the mean colour of one block.
-    """
+    """Means of the blocks of a pair of images."""
 
     time_s: float  # arrival time of the later image, on any clock that increases (s)
-    visual: Blocks  # block means of the visual image
-    tactile: Blocks  # block means of the tactile image
-    imprint: SmallBlocks  # means of the small blocks of the tactile image, in which contacts are detected
+    visual: Blocks
+    tactile: Blocks
+    imprint: SmallBlocks  # small blocks of the tactile image, in which contacts are detected
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class EmptyPad:
-    """The appearance of the empty pad in a visual and a tactile image, and the noise of this appearance.
+    """Means of the blocks of the empty pad, and the standard deviations of their noise (0: unknown)."""
 
-    Each image is divided into 24 rows of 32 blocks, and the tactile image also into 48 rows of 64 small blocks. A block
-    mean is the mean colour of one block. Each block mean varies from image to image, and the standard deviation of this
-    variation is the noise of the block. An unknown noise is stored as 0. All values have the scale of the images, 0 to
-    255.
-    """
-
-    visual: Blocks  # block means of the visual image
-    tactile: Blocks  # block means of the tactile image
-    imprint: SmallBlocks  # means of the small blocks of the tactile image
-    visual_noise: Blocks  # standard deviations of the noise of `visual`
-    tactile_noise: Blocks  # standard deviations of the noise of `tactile`
-    imprint_noise: SmallBlocks  # standard deviations of the noise of `imprint`
+    visual: Blocks
+    tactile: Blocks
+    imprint: SmallBlocks
+    visual_noise: Blocks
+    tactile_noise: Blocks
+    imprint_noise: SmallBlocks
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class State:
-    """The state of the guide.
+    """The state of the guide, from `start`."""
 
-    The guide is the state machine that leads a person through the recording of trajectories. `start` makes the first
-    state.
-    """
-
-    stage: Stage  # current stage
-    since_s: float | None  # time of the first observation in this stage (s), None: there was none
-    now_s: float | None  # time of the last observation (s), None: there was none
-    empty: EmptyPad | None  # the empty pad, None: not known yet
-    trusted: bool  # in the stage CLEAR: True if the person or the program has stated that the pad is empty
-    contact: bool  # True if the last tactile image shows a contact
-    still: bool  # True if nothing has moved between the first observation of the window and the last one
-    window: tuple[Observation, ...]  # observations since the last movement: the first one and the newest ones
-    count: int  # number of observations since the last movement, with the ones that are not kept in `window`
-    initial: Observation | None  # observation of the initial pair of the current trajectory, None: not taken yet
+    stage: Stage = Stage.CLEAR
+    since_s: float | None = None  # time of the first observation in this stage (s), None: there was none
+    now_s: float | None = None  # time of the last observation (s), None: there was none
+    empty: EmptyPad | None = None  # the empty pad, None: not known yet
+    trusted: bool = False  # in the stage CLEAR: the person or the program has stated that the pad is empty
+    contact: bool = False  # the last tactile image shows a contact
+    still: bool = False  # nothing has moved between the first observation of the window and the last one
+    window: tuple[Observation, ...] = ()  # observations since the last movement: the first one and the newest ones
+    count: int = 0  # number of observations since the last movement, with the ones that are not kept in `window`
+    initial: Observation | None = None  # observation of the initial pair, None: not taken yet
 
 
-def observe(
-    time_s: float, visual: UInt8[np.ndarray, "height width 3"], tactile: UInt8[np.ndarray, "height width 3"]
-) -> Observation:
-    """Compute the mean colour of each block of a pair of images.
-
-    Each image is divided into 24 rows of 32 blocks, and the tactile image also into 48 rows of 64 small blocks.
-
-    Args:
-        time_s: Arrival time of the later image, on any clock that increases (s).
-        visual: Raw visual image, RGB, of any size.
-        tactile: Raw tactile image, RGB, of any size.
-
-    Returns:
-        The time and the block means of both images.
-    """
+def observe(time_s: float, visual: Image, tactile: Image) -> Observation:
+    """Average the blocks of a pair of raw images, whose later one arrived at `time_s` (s)."""
     imprint = cv2.resize(tactile, _SMALL_BLOCKS, interpolation=cv2.INTER_AREA).astype(np.float32)
     return Observation(time_s, thumbnail(visual), thumbnail(tactile), imprint)
 
 
 def empty_pad(observations: Sequence[Observation]) -> EmptyPad:
-    """Measure the appearance of the empty pad, and its noise, from several observations.
-
-    An observation contains the mean colours of blocks of a visual and a tactile image. The tactile image is divided
-    twice, into blocks and into small blocks, see `observe`. The mean colour of a block varies from observation to
-    observation, and the standard deviation of this variation is the noise of the block. A few observations can
-    underestimate the noise. The returned noise of a block is therefore at least the median noise of all blocks of the
-    same size in the same image.
-
-    Args:
-        observations: At least two observations of the empty pad without movement.
-
-    Returns:
-        The mean of the observations, and the noise of each block.
-
-    Raises:
-        ValueError: There are fewer than two observations.
-    """
-    if len(observations) < 2:
-        raise ValueError(
-            f"observations must contain at least 2 items, so that the noise can be measured, got {len(observations)}"
-        )
+    """Measure the empty pad and its noise from at least two observations without movement."""
     looks = [np.stack(blocks) for blocks in zip(*(seen[1:] for seen in observations), strict=True)]
     return EmptyPad(*(blocks.mean(0) for blocks in looks), *map(_noise, looks))
 
 
 def _noise(looks: Float[np.ndarray, "n rows columns 3"]) -> Float[np.ndarray, "rows columns 3"]:
-    """The noise of each block mean, from the block means of n images."""
+    """The noise of each block, at least the median of all blocks, because few observations can underestimate it."""
     deviation = looks.std(0, ddof=1)
     return np.maximum(deviation, np.median(deviation)).astype(np.float32)
 
 
-def known_pad(visual: UInt8[np.ndarray, "height width 3"], tactile: UInt8[np.ndarray, "height width 3"]) -> EmptyPad:
-    """Make an `EmptyPad` from one visual and one tactile image of the empty pad.
-
-    A sensor file, which describes a real sensor, refers to two such images. `Device.background` reads them.
-
-    The noise in the result is 0, because noise cannot be measured from a single image. If the noise is 0, `has_contact`
-    uses an estimate of the noise from the image that it tests. Later, `step` measures the noise before each trajectory,
-    and the measured value replaces the 0.
-
-    Args:
-        visual: Raw image of the empty pad without light, RGB.
-        tactile: Raw image of the empty pad with light, RGB.
-    """
+def known_pad(visual: Image, tactile: Image) -> EmptyPad:
+    """The empty pad from one raw pair, such as the background images of a sensor file. Its noise is unknown."""
     looks = observe(0.0, visual, tactile)[1:]
     return EmptyPad(*looks, *map(np.zeros_like, looks))
 
@@ -206,31 +132,20 @@ def known_pad(visual: UInt8[np.ndarray, "height width 3"], tactile: UInt8[np.nda
 def start(empty: EmptyPad | None = None, *, trusted: bool = False) -> State:
     """Make the first state of the guide.
 
-    The guide is the state machine that leads a person through the recording of trajectories.
-
     Args:
-        empty: Appearance of the empty pad, for example from `known_pad`. None: not known yet.
+        empty: Appearance of the empty pad. None: not known yet.
         trusted: True if the pad is certainly empty now. If False and `empty` is None, the guide stays in the first
             stage until `confirm` is called.
     """
-    return State(Stage.CLEAR, None, None, empty, trusted, False, False, (), 0, None)
+    return State(empty=empty, trusted=trusted)
 
 
 def step(config: GuideConfig, state: State, observation: Observation) -> tuple[State, End | None]:
     """Advance the guide by one pair of images.
 
-    The guide is the state machine that leads a person through the recording of trajectories.
-
-    Args:
-        config: Thresholds and times.
-        state: State after the previous pair of images.
-        observation: Result of `observe` for the new pair of images.
-
     Returns:
-        The new state, and "initial", "final" or None. For "initial", the caller must save the previous pair of images
-        as the pair of the held object. For "final", the caller must save the previous pair of images as the pair of the
-        object at rest. For None, there is nothing to save. The previous pair is saved and not the new one, because the
-        new pair proves that the object did not move while the previous pair was taken.
+        The new state, and "initial", "final" or None: the end as which the caller must save the previous pair of
+        images. The new pair proves that the object did not move while the previous pair was taken.
     """
     moved = not state.window or not _same(config, state, state.window[0], observation)
     window = (observation,) if moved else (state.window[0], *state.window[1:][-_KEPT:], observation)
@@ -269,17 +184,7 @@ def _clear(config: GuideConfig, state: State) -> State:
 
 
 def confirm(state: State) -> State:
-    """Return the guide's next state after the person has confirmed the current stage of recording a trajectory.
-
-    The guide is the state machine that leads a person through the recording of trajectories.
-
-    The meaning of a confirmation depends on the stage (`Stage`). In `CLEAR`, a confirmation means that the pad is
-    empty. In `RELEASE`, it means that the object is released. In `REVIEW`, it means that the trajectory is good. In all
-    other stages, the state is returned unchanged.
-
-    Args:
-        state: Current state of the guide.
-    """
+    """The state after the person has confirmed that the pad is empty, the object released, or the trajectory good."""
     match state.stage:
         case Stage.CLEAR:
             return dataclasses.replace(state, trusted=True, window=(), count=0)
@@ -291,51 +196,24 @@ def confirm(state: State) -> State:
 
 
 def discard(state: State) -> State:
-    """Discard the current trajectory, and return to the stage `CLEAR`, in which the person clears the pad.
-
-    In `CLEAR` and in the next stage `PLACE`, no trajectory has begun, and the state is returned unchanged.
-
-    Args:
-        state: Current state of the guide.
-    """
+    """Discard the current trajectory, and return to the stage `CLEAR`."""
     return state if state.stage in (Stage.CLEAR, Stage.PLACE) else _enter(state, Stage.CLEAR)
 
 
 def interrupted(state: State) -> State:
-    """Restart the guide's measurement of the time for which nothing has moved in the images.
-
-    Call this function after a gap in the images, for example after the camera was disconnected. An object may have
-    moved during the gap.
-
-    Args:
-        state: Current state of the guide.
-    """
+    """The state after a gap in the images, in which the object may have moved."""
     return dataclasses.replace(state, window=(), count=0, still=False)
 
 
 def _enter(state: State, stage: Stage) -> State:
-    """The state at the beginning of a stage."""
     initial = None if stage in (Stage.CLEAR, Stage.PLACE) else state.initial
     return dataclasses.replace(state, stage=stage, since_s=state.now_s, window=(), count=0, initial=initial)
 
 
 def has_contact(config: GuideConfig, empty: EmptyPad, observation: Observation) -> bool:
-    """Return True if the tactile image shows a contact.
+    """Whether the tactile image shows a contact: enough small blocks differ from the empty pad.
 
-    The tactile image is divided into 48 rows of 64 small blocks. The mean colour of the empty pad is subtracted from
-    the mean colour of the image in each block. The median of these differences over all blocks is then subtracted from
-    each difference, so that a change in the brightness of the whole image is not a contact. The image shows a contact
-    if the magnitude of the remaining difference exceeds a threshold in at least `config.contact_blocks` blocks.
-
-    The threshold is `config.deviations` times the standard deviation of the noise of a difference, but at least
-    `config.smallest_change` and at most `config.largest_threshold`. The standard deviation is the larger of two
-    estimates: `empty.imprint_noise * sqrt(1 + 1 / config.pairs)`, and 1.4826 times the median absolute value of the
-    remaining differences.
-
-    Args:
-        config: Thresholds.
-        empty: Appearance of the empty pad, from `empty_pad` or `known_pad`.
-        observation: Result of `observe` for the pair of images to test.
+    The median difference is subtracted first, so that a change in the brightness of the whole image is no contact.
     """
     change = observation.imprint - empty.imprint
     change = change - np.median(change, axis=(0, 1))
@@ -347,9 +225,8 @@ def has_contact(config: GuideConfig, empty: EmptyPad, observation: Observation) 
 
 
 def _same(config: GuideConfig, state: State, first: Observation, second: Observation) -> bool:
-    """Return True if two observations show no movement. Before the empty pad is known, the noise is estimated."""
-    streams: tuple[Literal["visual", "tactile"], ...] = ("visual", "tactile")
-    for stream in streams if config.watched == "both" else streams[1:]:
+    """Whether two observations show no movement. Before the empty pad is known, the noise is estimated."""
+    for stream in ("visual", "tactile") if config.watched == "both" else ("tactile",):
         one, two = getattr(first, stream), getattr(second, stream)
         if state.empty is None:
             # The median over all blocks is robust against a small object that moves.
@@ -362,15 +239,12 @@ def _same(config: GuideConfig, state: State, first: Observation, second: Observa
     return True
 
 
-def _threshold(
-    config: GuideConfig, noise: Blocks | SmallBlocks | float | np.floating
-) -> Blocks | SmallBlocks | np.floating:
+def _threshold(config: GuideConfig, noise: np.ndarray | np.floating) -> np.ndarray | np.floating:
     """The threshold of a change for a standard deviation of the noise."""
     return np.clip(config.deviations * np.asarray(noise), config.smallest_change, config.largest_threshold)
 
 
 def _rested(config: GuideConfig, state: State, least_s: float) -> bool:
-    """Return True if nothing has moved for a time and in enough pairs."""
     return state.count >= config.pairs and state.window[-1].time_s - state.window[0].time_s >= least_s
 
 
@@ -392,14 +266,7 @@ _HINTS = {
 
 
 def instruction(config: GuideConfig, state: State) -> str:
-    """Return the instruction for the person who records a trajectory, such as "Hold the object still."
-
-    If the guide has been in the same stage for at least `config.hint_s` seconds, most instructions also contain a hint.
-
-    Args:
-        config: Thresholds and times of the guide.
-        state: Current state of the guide.
-    """
+    """The instruction for the person, after `config.hint_s` seconds in the same stage with a hint."""
     if state.stage is Stage.CLEAR and state.empty is None and not state.trusted:
         return f"{_INSTRUCTIONS[Stage.CLEAR]} Then confirm."
     late = state.now_s is not None and state.since_s is not None and state.now_s - state.since_s >= config.hint_s
