@@ -3,7 +3,7 @@
 import dataclasses
 import enum
 import time
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from sts_jax.hardware import guide
 from sts_jax.hardware.camera import CameraLostError, CameraTimeoutError, FrozenCameraError, StaleFrameError
@@ -48,6 +48,7 @@ class View:
     final: Pair | None  # final pair of the current trajectory, None: not taken yet
 
 
+@runtime_checkable
 class PairReader(Protocol):
     """A sensor, such as `STS`, `Replay` or `twin.VirtualSensor`."""
 
@@ -55,6 +56,7 @@ class PairReader(Protocol):
         """Return a new visual and a new tactile image. Both arrive after the beginning of the call."""
 
 
+@runtime_checkable
 class Person(Protocol):
     """The interface to the person, such as a web page or a terminal.
 
