@@ -28,7 +28,7 @@ from tqdm import tqdm
 
 import sts_jax as sts
 from benchmarks.instruments.experiments import EXPERIMENTS
-from experiments.shared import rerolls, stages
+from experiments.shared import evaluate, run
 from sts_jax import dataset, evaluation, storage
 
 
@@ -87,14 +87,15 @@ def main(args: Args) -> None:
         config = dataclasses.replace(config, collection=collection)
     with tempfile.TemporaryDirectory() as temporary, storage.lock(args.workdir or Path(temporary)):
         folder = args.workdir or Path(temporary)
-        stages.claim(config, folder)
-        data = stages.collect(config, folder, sensor)
+        data = run.collect(config, folder, sensor)
         rows = evaluation.rows_of(data, config.splits[0])
         pairs = data.pairs(rows["train"]), data.pairs(rows["test"][: config.num_rerolled])
     train, test = (dataset.reduced(part, config.image_size) for part in pairs)
     judge = evaluation.scorer(config.collection.scenario, train)
     with tqdm(total=args.times * len(test.object), desc="re-roll", unit="trajectories") as bar:
-        made = rerolls.reroll(config.collection, sensor, test, args.times, judge, lambda done: bar.update(done - bar.n))
+        made = evaluate.reroll(
+            config.collection, sensor, test, args.times, judge, lambda done: bar.update(done - bar.n)
+        )
     scores = dict(made.scores)
     for title, row in evaluation.baselines(config.collection.scenario, train, test).items():
         scores[title] = judge(row, test)

@@ -28,7 +28,7 @@ from jaxtyping import Array, Float
 
 import sts_jax as sts
 from benchmarks.instruments.experiments import EXPERIMENTS
-from experiments.shared import command, stages
+from experiments.shared import run
 from sts_jax import dataset, evaluation, statespace, storage, training
 
 BATCH, RATE, WARMUP = 32, 1e-3, 100
@@ -40,7 +40,7 @@ TITLE = "deterministic network, from all inputs"
 class Args:
     """Options of the command line."""
 
-    workdir: Annotated[command.Folder, tyro.conf.Positional]  # work directory of an experiment
+    workdir: Annotated[run.Folder, tyro.conf.Positional]  # work directory of an experiment
     scenario: Literal["freefall", "inclined", "perturbed"] = "freefall"  # scenario of the work directory
     preset: Literal["smoke", "default", "long"] = "default"  # preset of the work directory
     seconds: float = 420.0  # duration of the training after compilation (s)
@@ -168,7 +168,7 @@ def fit(
 
 
 def predict(
-    graphdef: nnx.GraphDef[Network], params: nnx.State, job: stages.Job, arrays: training.Arrays
+    graphdef: nnx.GraphDef[Network], params: nnx.State, job: run.Job, arrays: training.Arrays
 ) -> evaluation.Predicted:
     """Predict the last images, pose and outcome of every trajectory.
 
@@ -195,11 +195,10 @@ def main(args: Args) -> str:
     sts.enable_compilation_cache()
     config, sensor = EXPERIMENTS[args.scenario].PRESETS[args.preset], sts.Sensor()
     with storage.lock(args.workdir):
-        stages.claim(config, args.workdir)
-        data = stages.collect(config, args.workdir, sensor)
+        data = run.collect(config, args.workdir, sensor)
     rows, scenario = evaluation.rows_of(data, config.splits[0]), config.collection.scenario
     train, given = data.pairs(rows["train"]), data.pairs(rows["test"])
-    job = next(stages.jobs(config, sensor, train))
+    job = next(run.jobs(config, sensor, train))
     assert isinstance(job.model, statespace.Config)
     held_out = training.state_arrays(given, job.model, scenario, job.preprocessing, job.empty)
     numbers = 12 + len(job.preprocessing.condition_scale)

@@ -33,9 +33,9 @@ import numpy as np
 import tyro
 
 import sts_jax as sts
-from experiments.shared import errors, output
-from experiments.shared.command import Folder
-from experiments.shared.progress import Bar
+from experiments.shared import drawing, terminal
+from experiments.shared.run import Folder
+from experiments.shared.terminal import Bar
 from sts_jax import hardware, storage
 from sts_jax.evaluation import gap
 from sts_jax.hardware import twin
@@ -353,7 +353,7 @@ def main(args: Args) -> None:
             f"{gap.LEAST_SIDE} pixels, got {height} x {width}"
         )
     if args.out is not None:
-        output.make_folder(args.out.parent)
+        drawing.make_folder(args.out.parent)
     recordings = sessions(args)
     images = recordings.images()
     visual = np.stack([images.initial_visual, images.final_visual], 1).reshape(-1, *SIZE, 3)
@@ -370,5 +370,5 @@ def main(args: Args) -> None:
 
 if __name__ == "__main__":
     sts.enable_compilation_cache()
-    with errors.on_one_line():
+    with terminal.on_one_line():
         main(tyro.cli(Args, description=__doc__))

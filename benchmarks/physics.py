@@ -47,7 +47,7 @@ import tyro
 from benchmarks.instruments import fresh
 from benchmarks.instruments.starts import bodies, rigid_of
 from benchmarks.instruments.timing import in_turn
-from experiments.shared import output
+from experiments.shared import drawing
 from sts_jax import dataset, objects, physics, storage
 from sts_jax.dataset.rendering import RENDER_BATCH
 from sts_jax.physics import bodies as physics_bodies
@@ -302,7 +302,7 @@ def write_scaling(rows: Sequence[Speeds], device: str, chunk: int) -> None:
     axes.title.set_fontsize(9)
     axes.grid(alpha=0.3, which="both")
     axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(0.02, 0.52))
-    output.write_figure(RESULTS / "scaling.png", figure, dpi=150)
+    drawing.write_figure(RESULTS / "scaling.png", figure, dpi=150)
 
 
 def draw(body: objects.Body, traj: physics.Trajectory) -> None:

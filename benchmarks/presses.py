@@ -40,7 +40,7 @@ from jaxtyping import Array, Float
 from PIL import Image
 from scipy.optimize import nnls
 
-from experiments.shared import output
+from experiments.shared import drawing
 from sts_jax import storage, tactile
 
 PITCH = 0.0295e-3  # m per pixel (taxim/calib/gelsight/params.json)
@@ -331,7 +331,7 @@ def main() -> None:
     say(f"near: {np.sum((x < across) & (y < down))} under the picture, {z.min():.1f} to {z.max():.0f} mm below the gel")
     say(f"fall-off {lights.falloff:.2f}, specular {constants.specular:.3f}, shininess {constants.shininess:.2f}")
     strip = np.concatenate([panel(presses, int(index), constants, lights) for index in np.flatnonzero(held)], axis=1)
-    output.write_picture(OUT / "presses.png", Image.fromarray(np.round(255 * strip).astype(np.uint8)))
+    drawing.write_picture(OUT / "presses.png", Image.fromarray(np.round(255 * strip).astype(np.uint8)))
     storage.write_bytes(OUT / "presses.txt", ("\n".join(lines) + "\n").encode())
 
 

@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 
 import sts_jax as sts
-from experiments.shared import command, output
+from experiments.shared import drawing, run
 from sts_jax import dataset
 
 NUMBER = 10
@@ -29,7 +29,7 @@ NUMBER = 10
 class Args:
     """Options of the command line."""
 
-    workdir: Annotated[command.Folder, tyro.conf.Positional]  # work directory of an experiment with trained models
+    workdir: Annotated[run.Folder, tyro.conf.Positional]  # work directory of an experiment with trained models
     out: Path = Path("recognise.png")  # file of the picture
     given: tuple[str, ...] = ()  # input modalities (default: all inputs of the model)
     first: int = 0  # index of the first trajectory in the held-out list, from 0
@@ -69,7 +69,7 @@ def main(args: Args) -> str:
         axis.imshow(image, interpolation="nearest")
         axis.set_title(title)
         axis.axis("off")
-    output.write_figure(args.out, figure, dpi=80)
+    drawing.write_figure(args.out, figure, dpi=80)
     answers = " ".join(f"{letter}{int(np.flatnonzero(order == k)[0]) + 1}" for k, letter in enumerate(letters))
     return f"{args.out}: from {' and '.join(given)}, held-out {rows[0]} to {rows[-1]}\nanswers: {answers}"
 

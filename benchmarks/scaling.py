@@ -23,9 +23,9 @@ import tyro
 
 import sts_jax as sts
 from benchmarks.instruments.experiments import EXPERIMENTS
-from experiments.shared import command, stages
+from experiments.shared import run
 from experiments.shared.config import Config
-from experiments.shared.progress import say
+from experiments.shared.terminal import say
 from sts_jax import dataset, evaluation, storage
 from sts_jax.evaluation.figures import Trained, scaling
 
@@ -37,7 +37,7 @@ SUBSETS = (("visual", "pose"), ("visual",))
 class Args:
     """Options of the command line."""
 
-    workdir: Annotated[command.Folder, tyro.conf.Positional]  # work directory of an experiment
+    workdir: Annotated[run.Folder, tyro.conf.Positional]  # work directory of an experiment
     scenario: Literal["freefall", "inclined", "perturbed"] = "freefall"  # scenario of the work directory
     preset: Literal["smoke", "default", "long"] = "default"  # preset of the work directory
     # shares of the training objects. A model of each share is trained for the largest number of `steps`
@@ -84,12 +84,17 @@ def train(
     objects = np.unique(falls.object)
     kept = objects[: max(round(share * len(objects)), 1)]
     pairs, views, falls = some(pairs, kept), some(views, kept), some(falls, kept)
-    job = next(stages.jobs(config, sts.Sensor(), pairs, views, falls))
+    job = next(run.jobs(config, sts.Sensor(), pairs, views, falls))
     warmup = min(job.schedule.warmup, steps // 4)
     schedule = dataclasses.replace(job.schedule, steps=steps, warmup=warmup, seed=seed)
     note, stamps = folder / "seconds.json", []
     if not note.exists():
-        stages.run(job._replace(schedule=schedule), folder, config.targets, lambda *_: stamps.append(time.monotonic()))
+        run.train_model(
+            job._replace(schedule=schedule),
+            folder,
+            config.targets,
+            progress=lambda *_: stamps.append(time.monotonic()),
+        )
         storage.write_json(note, float(np.median(np.diff(stamps))) * steps)
     return len(falls.object), storage.read_json(note, f"delete {folder}") / 60
 
@@ -114,8 +119,7 @@ def main(args: Args) -> str:
     sts.enable_compilation_cache()
     config = EXPERIMENTS[args.scenario].PRESETS[args.preset]
     with storage.lock(args.workdir):
-        stages.claim(config, args.workdir)
-        data = stages.collect(config, args.workdir, sts.Sensor())
+        data = run.collect(config, args.workdir, sts.Sensor())
         sizes = dict.fromkeys([(share, max(args.steps)) for share in args.shares] + [(1.0, n) for n in args.steps])
         given = data.pairs(data.members("test"))
         test, scenario = dataset.reduced(given, config.image_size), config.collection.scenario

@@ -25,8 +25,8 @@ import tyro
 
 import sts_jax as sts
 from benchmarks.instruments.experiments import EXPERIMENTS
-from experiments.shared.judging import MAIN_SUBSETS
-from experiments.shared.progress import Bar
+from experiments.shared.evaluate import MAIN_SUBSETS
+from experiments.shared.terminal import Bar
 from sts_jax import dataset, evaluation, physics, statespace
 
 PER_OBJECT = 4  # trajectories of each object

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import tyro
 
-from experiments.shared import commissioning, errors
+from experiments.shared import commissioning, terminal
 from sts_jax import hardware
 
 
@@ -81,7 +81,7 @@ def main(config: Config) -> None:
 if __name__ == "__main__":
     arguments = tyro.cli(Config, description=__doc__)
     try:
-        with errors.on_one_line():
+        with terminal.on_one_line():
             main(arguments)
     except KeyboardInterrupt:
         number = len(list((arguments.out / "board").glob("*.png")))

@@ -28,8 +28,8 @@ import tyro
 from matplotlib.figure import Figure
 
 import sts_jax as sts
-from experiments.shared import laying, output
-from experiments.shared.errors import on_one_line
+from experiments.shared import drawing, laying
+from experiments.shared.terminal import on_one_line
 from sts_jax import tactile
 
 # Standard deviations of the Gaussian blur that is applied to images before they are compared (m). The first one is
@@ -233,7 +233,7 @@ def draw(config: Config, target: np.ndarray, paths: list[list[tuple[np.ndarray, 
     axes[5].set(
         title=f"the paths of {len(paths)} starts", xlabel="x off by (mm)", ylabel="y off by (mm)", aspect="equal"
     )
-    output.write_figure(config.out, figure, dpi=100)
+    drawing.write_figure(config.out, figure, dpi=100)
 
 
 def main(config: Config) -> None:

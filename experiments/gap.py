@@ -27,8 +27,8 @@ import numpy as np
 import tyro
 
 import sts_jax as sts
-from experiments.shared import errors, output
-from experiments.shared.command import Folder
+from experiments.shared import drawing, terminal
+from experiments.shared.run import Folder
 from sts_jax import dataset, hardware, storage
 from sts_jax.evaluation import figures, gap
 
@@ -275,7 +275,7 @@ def main(config: Config) -> None:
     """
     if config.rows < 1:
         raise ValueError(f"--rows must be >= 1, got {config.rows}")
-    output.make_folder(config.out)
+    drawing.make_folder(config.out)
     real, simulated = load(config)
     matched = config.match == "number"
     text = report(real, simulated, matched=matched)
@@ -286,5 +286,5 @@ def main(config: Config) -> None:
 
 if __name__ == "__main__":
     arguments = tyro.cli(Config, description=__doc__)
-    with errors.on_one_line(debug=arguments.debug):
+    with terminal.on_one_line(debug=arguments.debug):
         main(arguments)

@@ -5,7 +5,6 @@
     python -m experiments.inclined --model paper      # the paper's four models instead of the state-space model
     python -m experiments.inclined --preset smoke     # about two minutes, for tests
     python -m experiments.inclined --preset paper     # the paper's data size and training schedule: hours, a GPU helps
-    python -m experiments.inclined --plan             # prints the expected seconds of each stage
 
 Results go to `runs/inclined/`: config.json, dataset/, models/NAME/, metrics.json, table.md and figures/*.png. A second
 run with the same `--workdir` resumes after an interruption, and leaves finished results unchanged. `--only train` runs
@@ -14,7 +13,7 @@ one stage. Every field of the configuration is an option too, such as `--collect
 
 import dataclasses
 
-from experiments.shared import command, config
+from experiments.shared import config, run
 from sts_jax import dataset, physics
 from sts_jax.training import TrainConfig
 
@@ -46,4 +45,4 @@ PAPER = config.paper(COLLECTION, num_objects=480, num_per_object=5)  # 2,400 tra
 PRESETS = {"smoke": SMOKE, "default": DEFAULT, "long": LONG, "paper": PAPER}
 
 if __name__ == "__main__":
-    command.run(PRESETS, "runs/inclined", __doc__)  # collect, train, evaluate: shared.stages.main
+    run.command(PRESETS, "runs/inclined", __doc__)

@@ -28,12 +28,12 @@ from typing import Literal
 import tyro
 
 import sts_jax as sts
-from experiments.shared import errors
+from experiments.shared import terminal
 from experiments.shared.live import Backgrounds, Image, Live, Seen, Views
 from experiments.shared.live_page import LivePage
 from experiments.shared.live_panel import PanelFile, lines
 from experiments.shared.own_twin import own_twin
-from experiments.shared.progress import say
+from experiments.shared.terminal import say
 from sts_jax import hardware
 
 PRINT_S = 1.0  # time between two lines in the terminal (s)
@@ -332,7 +332,7 @@ def summarise(live: Live, sensor: hardware.STS | hardware.Replay, duration_s: fl
 
 def main(config: Config) -> None:
     """Load the model, and show predictions until the images end, the time `--seconds` is over, or a user quits."""
-    with errors.on_one_line(debug=config.debug):
+    with terminal.on_one_line(debug=config.debug):
         try:
             check(config)
             sts.enable_compilation_cache()
@@ -351,5 +351,5 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    errors.interrupt_on_sigterm()
+    terminal.interrupt_on_sigterm()
     main(tyro.cli(Config, description=__doc__))

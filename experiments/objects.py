@@ -23,7 +23,7 @@ import tyro
 from matplotlib import pyplot
 
 import sts_jax as sts
-from experiments.shared import errors, output
+from experiments.shared import drawing, terminal
 from sts_jax import optics, storage
 
 DISTANCE = 0.42  # distance from the camera to the object (m)
@@ -109,7 +109,7 @@ def main(config: Config) -> None:
     if config.num < 1:
         raise ValueError(f"--num is {config.num}, but the number of objects per class must be at least 1")
     families = {category: sts.objects.find_family(category) for category in config.categories}
-    output.check_picture(config.out)
+    drawing.check_picture(config.out)
     key = jax.random.key(config.seed)
     drawn = []
     for category, family in families.items():
@@ -135,10 +135,10 @@ def main(config: Config) -> None:
         axis.set_title(str(index + 1) if config.shuffle else category, fontsize=7, pad=1)
         axis.axis("off")
     figure.subplots_adjust(0.005, 0.005, 0.995, 0.985, 0.02, 0.08)
-    output.write_figure(config.out, figure, dpi=100)
+    drawing.write_figure(config.out, figure, dpi=100)
     pyplot.close(figure)
 
 
 if __name__ == "__main__":
-    with errors.on_one_line():
+    with terminal.on_one_line():
         main(tyro.cli(Config))

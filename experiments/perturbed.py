@@ -5,7 +5,6 @@
     python -m experiments.perturbed --model paper      # the paper's four models instead of the state-space model
     python -m experiments.perturbed --preset smoke     # about two minutes, for tests
     python -m experiments.perturbed --preset paper     # the paper's data size and training schedule: hours, a GPU helps
-    python -m experiments.perturbed --plan             # prints the expected seconds of each stage
 
 A jerk is a short sideways acceleration of the pad. It is not a derivative of the acceleration.
 
@@ -16,7 +15,7 @@ one stage. Every field of the configuration is an option too, such as `--collect
 
 import dataclasses
 
-from experiments.shared import command, config
+from experiments.shared import config, run
 from sts_jax import dataset, physics
 from sts_jax.training import TrainConfig
 
@@ -48,4 +47,4 @@ PAPER = config.paper(COLLECTION, num_objects=500, num_per_object=5)  # 2,500 tra
 PRESETS = {"smoke": SMOKE, "default": DEFAULT, "long": LONG, "paper": PAPER}
 
 if __name__ == "__main__":
-    command.run(PRESETS, "runs/perturbed", __doc__)  # collect, train, evaluate: shared.stages.main
+    run.command(PRESETS, "runs/perturbed", __doc__)

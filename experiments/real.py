@@ -36,11 +36,11 @@ from typing import Annotated
 import tyro
 
 import sts_jax as sts
-from experiments.shared import errors
+from experiments.shared import terminal
 from experiments.shared.collecting import Collect, collect
-from experiments.shared.command import chosen_preset
 from experiments.shared.recorded import Config
 from experiments.shared.reviewing import Review, review
+from experiments.shared.run import chosen_preset
 from experiments.shared.table2_command import Train, learn
 from sts_jax.training import TrainConfig
 
@@ -75,7 +75,7 @@ def parse(words: Sequence[str]) -> Train | Collect | Review:
 
 def main(config: Train | Collect | Review) -> None:
     """Run a sub-command. If the user can correct an error, print the error on one line without a traceback."""
-    with errors.on_one_line(debug=config.debug):
+    with terminal.on_one_line(debug=config.debug):
         try:
             match config:
                 case Train():
@@ -90,5 +90,5 @@ def main(config: Train | Collect | Review) -> None:
 
 if __name__ == "__main__":
     sts.enable_compilation_cache()
-    errors.interrupt_on_sigterm()
+    terminal.interrupt_on_sigterm()
     main(parse(sys.argv[1:]))

@@ -5,7 +5,6 @@
     python -m experiments.released --model paper      # the paper's four models instead of the state-space model
     python -m experiments.released --preset smoke     # a few minutes, for tests
     python -m experiments.released --preset paper     # the paper's data size and training schedule: hours, a GPU helps
-    python -m experiments.released --plan             # prints the expected seconds of each stage
 
 The objects are small cameras (object class `camera`). This experiment is the simulated counterpart of the paper's real
 dataset. Results go to `runs/released/`: config.json, dataset/, models/NAME/, metrics.json, table.md and figures/*.png.
@@ -16,7 +15,7 @@ A second run with the same `--workdir` resumes after an interruption, and leaves
 
 import dataclasses
 
-from experiments.shared import command, config
+from experiments.shared import config, run
 from sts_jax import dataset, physics
 from sts_jax.training import TrainConfig
 
@@ -48,4 +47,4 @@ PAPER = config.paper(COLLECTION, num_objects=500, num_per_object=1)  # 500 traje
 PRESETS = {"smoke": SMOKE, "default": DEFAULT, "long": LONG, "paper": PAPER}
 
 if __name__ == "__main__":
-    command.run(PRESETS, "runs/released", __doc__)  # collect, train, evaluate: shared.stages.main
+    run.command(PRESETS, "runs/released", __doc__)

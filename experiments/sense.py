@@ -21,7 +21,7 @@ from matplotlib import colormaps
 from PIL import Image, ImageDraw, ImageFont
 
 import sts_jax as sts
-from experiments.shared import errors, output
+from experiments.shared import drawing, terminal
 from experiments.shared.laying import Config, check, lay, read
 from sts_jax import tactile
 
@@ -142,7 +142,7 @@ def main(config: Config) -> None:
         print(f"{name}: {size} mm, {faces}\n{lines}", flush=True)
         pictures = panels(frame, between, config.light)
         if len(names) == 1:
-            output.write_picture(config.out, compose(pictures, 3))
+            drawing.write_picture(config.out, compose(pictures, 3))
         else:
             small = SHEET[0] / config.resolution[0]
             for stream, values in pictures[:3]:
@@ -150,11 +150,11 @@ def main(config: Config) -> None:
                 image = image.resize((round(image.width * small), SHEET[0]), Image.Resampling.BOX)
                 sheet.append((f"{name}, {stream}", np.asarray(image) / 255))
     if sheet:
-        output.write_picture(config.out, compose(sheet, 6))
+        drawing.write_picture(config.out, compose(sheet, 6))
     print(config.out)
 
 
 if __name__ == "__main__":
     sts.enable_compilation_cache()
-    with errors.on_one_line():
+    with terminal.on_one_line():
         main(tyro.cli(Config, description=__doc__))

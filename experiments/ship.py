@@ -18,7 +18,7 @@ import numpy as np
 import tyro
 
 import sts_jax as sts
-from experiments.shared import command, errors
+from experiments.shared import run, terminal
 from sts_jax.predict import MODELS
 
 LIMIT = 12e6  # largest size of a model's folder (bytes)
@@ -30,7 +30,7 @@ LIFT = 0.04  # height of every second bottle above the pad (m), because models o
 class Args:
     """Options of the command line."""
 
-    workdir: Annotated[command.Folder, tyro.conf.Positional]  # work directory of an experiment
+    workdir: Annotated[run.Folder, tyro.conf.Positional]  # work directory of an experiment
     name: str | None = None  # name of the model in the library. None: the name of the work directory
 
 
@@ -109,6 +109,6 @@ def bottles(view: sts.training.Preprocessing) -> np.ndarray:
 
 if __name__ == "__main__":
     args = tyro.cli(Args, description=__doc__)
-    with errors.on_one_line():
+    with terminal.on_one_line():
         sts.enable_compilation_cache()
         print(ship(args.workdir, args.name or args.workdir.resolve().name))

@@ -17,7 +17,7 @@ import tyro
 
 import sts_jax as sts
 from experiments import freefall, inclined, perturbed, released
-from experiments.shared import errors, output, pictures
+from experiments.shared import drawing, terminal
 from sts_jax import dataset, evaluation
 
 SCENARIOS = {
@@ -50,7 +50,7 @@ def main(config: Config) -> None:
         raise ValueError(f"scenario is {config.scenario!r}, but it must be one of {', '.join(SCENARIOS)}")
     if config.num < 1:
         raise ValueError(f"--num is {config.num}, but it must be at least 1")
-    output.make_folder(config.out)
+    drawing.make_folder(config.out)
     sensor = sts.Sensor()
     collection = dataclasses.replace(SCENARIOS[config.scenario], num_objects=config.num, seed=config.seed)
     names, bodies = dataset.class_names(collection), dataset.make_bodies(collection, np.arange(config.num))
@@ -66,8 +66,8 @@ def main(config: Config) -> None:
             crop=False,
         )
         visual, tactile = (np.asarray(stream) / 255 for stream in seen[:2])
-        view = pictures.views(body, one.pose, one.gravity, sensor, collection.scenario.wall)
-        words = pictures.describe(collection.scenario, name, one._asdict(), one.hidden._asdict())
+        view = drawing.views(body, one.pose, one.gravity, sensor, collection.scenario.wall)
+        words = drawing.describe(collection.scenario, name, one._asdict(), one.hidden._asdict())
         path = config.out / f"{config.scenario}-{i}.png"
         evaluation.figures.strip(path, one.time, view, visual, tactile, one.wrench, title=words)
         evaluation.figures.animation(
@@ -86,5 +86,5 @@ def main(config: Config) -> None:
 
 if __name__ == "__main__":
     sts.enable_compilation_cache()
-    with errors.on_one_line():
+    with terminal.on_one_line():
         main(tyro.cli(Config, description=__doc__))

@@ -15,7 +15,7 @@ import threading
 import tyro
 
 import sts_jax as sts
-from experiments.shared import errors
+from experiments.shared import terminal
 from experiments.shared.twin_device import Config, make
 from sts_jax.hardware import twin
 
@@ -45,5 +45,5 @@ def _until_end_of_input(stop: threading.Event) -> None:
 
 if __name__ == "__main__":
     sts.enable_compilation_cache()
-    with errors.on_one_line():
+    with terminal.on_one_line():
         main(tyro.cli(Config, description=__doc__))

@@ -11,7 +11,7 @@ import trimesh
 
 import sts_jax as sts
 from experiments import freefall, inclined, perturbed, released
-from experiments.shared import command, config, errors, pictures, results, stages
+from experiments.shared import config, drawing, evaluate, run, terminal
 from sts_jax import compilation, dataset, physics, storage, training
 
 BOTTLES = ("bottle",)
@@ -58,7 +58,7 @@ def test_presets_hold_out_enough_objects_and_that_of_the_paper_has_its_counts(ex
     assert (schedule.epochs, schedule.batch_size, schedule.beta_warmup) == (200, 64, 50 / 200)
     assert (experiment.PAPER.targets, experiment.PAPER.splits) == ("own", ("trajectory", "object"))
     assert not experiment.PAPER.mask_blank_touch
-    model = training.paper_model(config.MODELS["paper"]["mvae"], stages.preprocessing_of(experiment.PAPER))
+    model = training.paper_model(config.MODELS["paper"]["mvae"], run.preprocessing_of(experiment.PAPER))
     assert [m.weight for m in model.modalities] == [1, 1, 1000]
     assert [m.shape for m in model.modalities] == [(64, 64, 3), (64, 64, 3), (7,)]
 
@@ -68,9 +68,9 @@ def test_options_reach_the_experiment(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(stages, "main", lambda config, workdir, only: ran.append((config, workdir)))
     monkeypatch.setattr(command, "plan", lambda config: f"plan of {config.collection.num_objects} objects")
     monkeypatch.setattr("sys.argv", ["freefall", "--hidden", "off", "--classes", "fork", "bottle", "--parts"])
-    command.run(freefall.PRESETS, str(tmp_path), "What it does.")
+    run.run(freefall.PRESETS, str(tmp_path), "What it does.")
     monkeypatch.setattr("sys.argv", ["freefall", "--preset", "smoke", "--workdir", str(tmp_path / "other")])
-    command.run(freefall.PRESETS, str(tmp_path), None)
+    run.run(freefall.PRESETS, str(tmp_path), None)
     collection = dataclasses.replace(
         freefall.DEFAULT.collection,
         scenario=physics.variant(physics.Freefall(), "off"),
@@ -80,15 +80,15 @@ def test_options_reach_the_experiment(tmp_path, monkeypatch, capsys):
     asked = dataclasses.replace(freefall.DEFAULT, collection=collection)
     assert ran == [(asked, tmp_path), (freefall.SMOKE, tmp_path / "other")]
     monkeypatch.setattr("sys.argv", ["freefall", "--plan"])
-    command.run(freefall.PRESETS, str(tmp_path), None)
+    run.run(freefall.PRESETS, str(tmp_path), None)
     assert capsys.readouterr().out == "plan of 2000 objects\n"
     assert len(ran) == 2
     assert list(tmp_path.iterdir()) == []
 
 
-def parsed(monkeypatch, *options: str, presets=freefall.PRESETS) -> command.Args:
+def parsed(monkeypatch, *options: str, presets=freefall.PRESETS) -> run.Args:
     monkeypatch.setattr("sys.argv", ["experiment", *options])
-    return command.parse(presets, "runs/experiment", None)
+    return run.parse(presets, "runs/experiment", None)
 
 
 def test_any_field_of_a_preset_can_be_changed(monkeypatch, capsys):
@@ -140,26 +140,26 @@ def test_one_stage_runs_on_the_results_of_the_stages_before_it(tmp_path, monkeyp
     monkeypatch.setattr(stages, "train", lambda *_: ran.append("train"))
     monkeypatch.setattr(stages, "evaluate", lambda *_: ran.append("evaluate"))
     monkeypatch.setattr(dataset, "load", lambda folder: None)
-    stages.main(freefall.SMOKE, tmp_path, only="collect")
+    run.main(freefall.SMOKE, tmp_path, only="collect")
     assert ran == ["collect"]
     with pytest.raises(FileNotFoundError, match=r"dataset is not a collected dataset: first run .* `--only collect`"):
-        stages.main(freefall.SMOKE, tmp_path, only="train")
+        run.main(freefall.SMOKE, tmp_path, only="train")
     (tmp_path / "dataset").mkdir()
     (tmp_path / "dataset" / "collection.json").write_text("{}")
-    stages.main(freefall.SMOKE, tmp_path, only="train")
+    run.main(freefall.SMOKE, tmp_path, only="train")
     assert ran == ["collect", "train"]
     with pytest.raises(FileNotFoundError, match=r"statespace is not a trained model: first run .* `--only train`"):
-        stages.main(freefall.SMOKE, tmp_path, only="evaluate")
+        run.main(freefall.SMOKE, tmp_path, only="evaluate")
     (tmp_path / "models" / "statespace").mkdir(parents=True)
     (tmp_path / "models" / "statespace" / "config.json").write_text("{}")
-    stages.main(freefall.SMOKE, tmp_path, only="evaluate")
+    run.main(freefall.SMOKE, tmp_path, only="evaluate")
     assert ran == ["collect", "train", "evaluate"]
-    stages.main(freefall.SMOKE, tmp_path)
+    run.main(freefall.SMOKE, tmp_path)
     assert ran[3:] == ["collect", "train", "evaluate"]
 
 
 def test_a_work_directory_of_another_configuration_names_the_fields_that_differ(tmp_path):
-    stages.claim(freefall.SMOKE, tmp_path)
+    run.claim(freefall.SMOKE, tmp_path)
     other = dataclasses.replace(
         freefall.SMOKE,
         image_size=32,
@@ -173,7 +173,7 @@ def test_a_work_directory_of_another_configuration_names_the_fields_that_differ(
         r"but the current settings have collection\.num_objects = 20, state_training\.steps = 9, image_size = 32 "
         r"\(also different: rerolls\): choose another folder",
     ):
-        stages.claim(other, tmp_path)
+        run.claim(other, tmp_path)
 
 
 @pytest.mark.parametrize("experiment", [freefall, perturbed])
@@ -181,8 +181,8 @@ def test_a_work_directory_of_another_configuration_names_the_fields_that_differ(
 def test_the_classes_of_the_experiment_or_the_requested_ones_are_taken_from_a_folder(
     experiment, asked, folder, tmp_path, capsys
 ):
-    args = command.Args(tmp_path / "run", smoke_of_few(experiment), objects=folder, classes=asked)
-    one = command.configure(args).collection
+    args = run.Args(tmp_path / "run", smoke_of_few(experiment), objects=folder, classes=asked)
+    one = run.configure(args).collection
     assert one.meshes is not None
     assert one.meshes.labels == ("bottle",) * 4 + ("box",) * (3 if asked else 0)
     assert one.num_objects == len(one.meshes.names)
@@ -194,34 +194,34 @@ def test_the_classes_of_the_experiment_or_the_requested_ones_are_taken_from_a_fo
     assert "bottle/3.stl" in listing.read_text()
     assert ("classes left out: box" in listing.read_text()) != bool(asked)
 
-    stages.note(listing, ["collect: left out object 0"])  # stays when the folder is read again
+    run.note(listing, ["collect: left out object 0"])  # stays when the folder is read again
     before = listing.stat().st_mtime_ns
-    assert command.configure(args).collection == one
+    assert run.configure(args).collection == one
     assert listing.stat().st_mtime_ns == before
 
 
 def test_all_classes_are_taken_from_a_folder_without_those_of_the_experiment(folder, tmp_path):
-    small = command.Args(tmp_path / "small", smoke_of_few(freefall), objects=folder, scale=0.5, up="y")
-    meshes = command.configure(small).collection.meshes
+    small = run.Args(tmp_path / "small", smoke_of_few(freefall), objects=folder, scale=0.5, up="y")
+    meshes = run.configure(small).collection.meshes
     assert meshes is not None
     assert (meshes.scale, meshes.up) == (0.5, "y")
     with pytest.raises(ValueError, match="--scale and --up apply only to mesh files in a folder"):
-        command.configure(command.Args(tmp_path, perturbed.SMOKE, up="y"))
+        run.configure(run.Args(tmp_path, perturbed.SMOKE, up="y"))
 
     (folder / "bottle").rename(folder / "jar")
-    one = command.configure(command.Args(tmp_path / "run", smoke_of_few(perturbed), objects=folder)).collection
+    one = run.configure(run.Args(tmp_path / "run", smoke_of_few(perturbed), objects=folder)).collection
     assert one.meshes is not None
     assert one.meshes.labels == ("box",) * 3 + ("jar",) * 4
 
 
 def test_unknown_classes_and_too_few_objects_are_refused(folder, tmp_path):
-    args = command.Args(tmp_path / "run", smoke_of_few(freefall), classes=("bottle", "teapot"))
+    args = run.Args(tmp_path / "run", smoke_of_few(freefall), classes=("bottle", "teapot"))
     with pytest.raises(ValueError, match=r"category is 'teapot', but it must be one of .*bottle"):
-        command.configure(args)
+        run.configure(args)
     with pytest.raises(ValueError, match=r"teapot.*bottle, box"):
-        command.configure(dataclasses.replace(args, objects=folder))
+        run.configure(dataclasses.replace(args, objects=folder))
     with pytest.raises(ValueError, match=r"num_objects is 3, .* at least 4 objects are needed: add usable objects"):
-        command.configure(dataclasses.replace(args, objects=folder, classes=("box",)))
+        run.configure(dataclasses.replace(args, objects=folder, classes=("box",)))
 
 
 @pytest.mark.parametrize(
@@ -239,9 +239,9 @@ def test_unknown_classes_and_too_few_objects_are_refused(folder, tmp_path):
 def test_a_collection_that_cannot_be_used_is_refused_before_anything_is_written(changes, message, tmp_path):
     wrong = dataclasses.replace(freefall.SMOKE, collection=dataclasses.replace(freefall.SMOKE.collection, **changes))
     with pytest.raises(ValueError, match=message):
-        command.configure(command.Args(tmp_path / "run", wrong))
+        run.configure(run.Args(tmp_path / "run", wrong))
     with pytest.raises(ValueError, match=message):
-        stages.main(wrong, tmp_path / "run")
+        run.main(wrong, tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
@@ -277,7 +277,7 @@ def test_objects_left_out_by_the_collection_are_listed_once(tmp_path, monkeypatc
     monkeypatch.setattr(dataset, "collect", lambda *args, **kwargs: made)
     monkeypatch.setattr(dataset, "load", lambda folder: None)
     for _ in range(2):
-        stages.collect(freefall.SMOKE, tmp_path, sts.Sensor())
+        run.collect(freefall.SMOKE, tmp_path, sts.Sensor())
     listed = "".join(f"collect: left out {line}\n" for line in made.left_out)
     assert (tmp_path / "objects.txt").read_text() == listed
 
@@ -298,7 +298,7 @@ def test_an_empty_name_of_a_folder_is_refused(flag, name, tmp_path, monkeypatch,
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.argv", ["freefall", flag, name])
     with pytest.raises(SystemExit) as stopped:
-        command.run(freefall.PRESETS, str(tmp_path), None)
+        run.run(freefall.PRESETS, str(tmp_path), None)
     assert stopped.value.code == 2
     assert "name of the folder is empty" in " ".join("".join(capsys.readouterr()).replace("│", " ").split())
     assert list(tmp_path.iterdir()) == []
@@ -309,13 +309,13 @@ def test_an_error_that_the_user_can_correct_is_one_line_unless_debug_is_set(tmp_
     path.write_text("")
     monkeypatch.setattr("sys.argv", ["freefall", "--preset", "smoke", "--workdir", str(path)])
     with pytest.raises(SystemExit, match=rf"^error: cannot create or write to {path}: .*Choose a folder"):
-        command.run(freefall.PRESETS, "unused", None)
+        run.run(freefall.PRESETS, "unused", None)
     monkeypatch.setattr("sys.argv", ["freefall", "--classes", "teapot"])
     with pytest.raises(SystemExit, match=r"^error: category is 'teapot'"):
-        command.run(freefall.PRESETS, str(tmp_path), None)
+        run.run(freefall.PRESETS, str(tmp_path), None)
     monkeypatch.setattr("sys.argv", ["freefall", "--classes", "teapot", "--debug"])
     with pytest.raises(ValueError, match="teapot"):
-        command.run(freefall.PRESETS, str(tmp_path), None)
+        run.run(freefall.PRESETS, str(tmp_path), None)
 
 
 def locked_twice(folder: Path) -> None:
@@ -333,7 +333,7 @@ def locked_twice(folder: Path) -> None:
     ],
 )
 def test_a_refusal_is_one_line(refused, tmp_path):
-    with pytest.raises(SystemExit, match=r"^error: ") as raised, errors.on_one_line():
+    with pytest.raises(SystemExit, match=r"^error: ") as raised, terminal.on_one_line():
         refused(tmp_path)
     assert raised.value.__suppress_context__
 
@@ -341,12 +341,12 @@ def test_a_refusal_is_one_line(refused, tmp_path):
 @pytest.mark.parametrize(
     ("fault", "kind"),
     [
-        (lambda: command.configure(None), AttributeError),
-        (lambda: pictures.describe(sts.physics.Freefall(), "cup", {}, {}), KeyError),
+        (lambda: run.configure(None), AttributeError),
+        (lambda: drawing.describe(sts.physics.Freefall(), "cup", {}, {}), KeyError),
     ],
 )
 def test_an_error_of_the_program_keeps_its_traceback(fault, kind):
-    with pytest.raises(kind), errors.on_one_line():
+    with pytest.raises(kind), terminal.on_one_line():
         fault()
 
 
@@ -355,16 +355,16 @@ def test_a_warning_is_one_line_and_later_warnings_are_as_before():
         return warnings.formatwarning("the mesh has a hole", UserWarning, "file.py", 1, "")
 
     usual = formatted()
-    with errors.on_one_line():
+    with terminal.on_one_line():
         assert formatted() == "note: the mesh has a hole\n"
-    with pytest.raises(SystemExit), errors.on_one_line():
+    with pytest.raises(SystemExit), terminal.on_one_line():
         raise ValueError
     assert formatted() == usual
 
 
 def test_a_second_run_in_a_work_directory_is_refused(tmp_path):
     with storage.lock(tmp_path), pytest.raises(storage.LockedError, match="close what uses the folder in this process"):
-        stages.main(freefall.SMOKE, tmp_path)
+        run.main(freefall.SMOKE, tmp_path)
     assert not (tmp_path / "config.json").exists()
 
 
@@ -372,7 +372,7 @@ def test_a_second_run_keeps_the_listing_of_the_first(folder, tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "objects.txt").write_text("of the first\n")
     with storage.lock(tmp_path / "run"), pytest.raises(storage.LockedError):
-        command.configure(command.Args(tmp_path / "run", smoke_of_few(freefall), objects=folder))
+        run.configure(run.Args(tmp_path / "run", smoke_of_few(freefall), objects=folder))
     assert (tmp_path / "run" / "objects.txt").read_text() == "of the first\n"
 
 
@@ -383,7 +383,7 @@ def evaluated(tmp_path: Path) -> Path:
     outputs = [tmp_path / "table.md", tmp_path / "figures" / "a.png"]
     for path in outputs:
         path.write_bytes(path.name.encode())
-    results.write(tmp_path / "metrics.json", {"split": "object"}, INPUTS, outputs)
+    evaluate.write(tmp_path / "metrics.json", {"split": "object"}, INPUTS, outputs)
     return tmp_path
 
 
@@ -391,7 +391,7 @@ INPUTS = {"dataset": "d" * 64, "models/mvae": "m" * 64}
 
 
 def test_results_are_valid_while_nothing_changes(evaluated):
-    assert results.stale(evaluated / "metrics.json", INPUTS) is None
+    assert evaluate.stale(evaluated / "metrics.json", INPUTS) is None
     content = json.loads((evaluated / "metrics.json").read_text())
     assert (content["split"], content["inputs"]) == ("object", INPUTS)
     assert set(content["outputs"]) == {"table.md", "figures/a.png"}
@@ -406,7 +406,7 @@ def test_results_are_valid_while_nothing_changes(evaluated):
     ],
 )
 def test_results_of_other_inputs_are_stale(evaluated, inputs, reason):
-    assert results.stale(evaluated / "metrics.json", inputs) == reason
+    assert evaluate.stale(evaluated / "metrics.json", inputs) == reason
 
 
 @pytest.mark.parametrize(
@@ -424,23 +424,23 @@ def test_results_that_are_missing_or_changed_are_stale(evaluated, name, content,
     (evaluated / name).unlink()
     if content is not None:
         (evaluated / name).write_bytes(content)
-    assert results.stale(evaluated / "metrics.json", INPUTS) == reason
+    assert evaluate.stale(evaluated / "metrics.json", INPUTS) == reason
 
 
 def test_a_changed_number_makes_results_stale(evaluated):
     path = evaluated / "metrics.json"
     path.write_text(path.read_text().replace('"object"', '"trajectory"'))
-    assert results.stale(path, INPUTS) == "metrics.json was changed"
+    assert evaluate.stale(path, INPUTS) == "metrics.json was changed"
 
 
 def test_the_identity_of_a_model_depends_on_all_its_files(tmp_path):
     (tmp_path / "checkpoints" / "1").mkdir(parents=True)
     weights = tmp_path / "checkpoints" / "1" / "weights"
     weights.write_bytes(b"1234")
-    before = results.identity(tmp_path)
+    before = evaluate.identity(tmp_path)
     (tmp_path / ".lock").write_bytes(b"")
-    assert results.identity(tmp_path) == before
+    assert evaluate.identity(tmp_path) == before
     weights.write_bytes(b"1235")
-    changed = results.identity(tmp_path)
+    changed = evaluate.identity(tmp_path)
     weights.rename(tmp_path / "weights")
-    assert len({before, changed, results.identity(tmp_path)}) == 3
+    assert len({before, changed, evaluate.identity(tmp_path)}) == 3

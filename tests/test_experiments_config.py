@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from experiments import freefall, inclined, perturbed, released
-from experiments.shared import config, stages
+from experiments.shared import config, run
 from sts_jax import dataset, training
 
 PRESETS = {
@@ -73,5 +73,5 @@ def test_image_sizes_divide_the_resolution_and_suit_the_networks(model, side, si
 def test_a_field_out_of_range_is_an_error_before_the_collection(fields, message, tmp_path, monkeypatch):
     monkeypatch.setattr(dataset, "collect", lambda *args, **kwargs: pytest.fail("collected"))
     with pytest.raises(ValueError, match=message):
-        stages.main(changed(**fields), tmp_path / "run")
+        run.main(changed(**fields), tmp_path / "run")
     assert not (tmp_path / "run").exists()

@@ -3,10 +3,10 @@
 import dataclasses
 
 import pytest
+from experiments.shared.duration import Line, Rate
 
 from experiments import freefall
 from experiments.shared import duration
-from experiments.shared.duration import Line, Rate
 from sts_jax import dataset
 
 CONFIG = dataclasses.replace(

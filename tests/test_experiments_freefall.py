@@ -11,7 +11,7 @@ from optics_bodies import public_meshes
 
 import sts_jax as sts
 from experiments import freefall
-from experiments.shared import config, rerolls, stages
+from experiments.shared import config, evaluate, run
 from sts_jax import dataset, evaluation, physics
 
 pytestmark = pytest.mark.slow
@@ -32,7 +32,7 @@ TINY = dataclasses.replace(
 @pytest.fixture(scope="module")
 def workdir(tmp_path_factory):
     workdir = tmp_path_factory.mktemp("runs") / "freefall"
-    stages.main(TINY, workdir)
+    run.main(TINY, workdir)
     return workdir
 
 
@@ -77,7 +77,7 @@ def test_the_ceilings_are_computed_once(workdir, monkeypatch):
     sensor, data = sts.Sensor(), dataset.load(workdir / "dataset")
     test = dataset.reduced(data.pairs(evaluation.rows_of(data, "object")["test"]), 64)
     monkeypatch.setattr(rerolls, "reroll", lambda *_: pytest.fail("computed again"))
-    found = rerolls.ceilings(workdir, "", TINY.collection, sensor, data, test, times=2, num=256, judge=None)
+    found = evaluate.ceilings(workdir, "", TINY.collection, sensor, data, test, times=2, num=256, judge=None)
     metrics = json.loads((workdir / "metrics.json").read_text())["predictors"]["ceiling (mean of re-rolls)"]
     own = found.scores["ceiling (mean of re-rolls)"]
     assert own.position.mean() == pytest.approx(metrics["position"]["value"])
@@ -88,7 +88,7 @@ def test_the_ceilings_are_computed_once(workdir, monkeypatch):
 
 def test_a_second_run_leaves_finished_results_unchanged(workdir):
     stamps = {path: path.stat().st_mtime_ns for path in workdir.rglob("*") if path.is_file()}
-    stages.main(TINY, workdir)
+    run.main(TINY, workdir)
     assert stamps == {path: path.stat().st_mtime_ns for path in workdir.rglob("*") if path.is_file()}
 
 
@@ -97,7 +97,7 @@ def test_stale_results_are_computed_again(workdir, capsys):
     before = metrics.read_text(), table.read_text()
     table.write_text("rubbish")
     (workdir / "figures" / "strip.png").unlink()
-    stages.main(TINY, workdir)
+    run.main(TINY, workdir)
     assert (metrics.read_text(), table.read_text()) == before
     assert (workdir / "figures" / "strip.png").exists()
     said = capsys.readouterr()
@@ -107,17 +107,17 @@ def test_stale_results_are_computed_again(workdir, capsys):
     log = workdir / "models" / "mvae" / "metrics.jsonl"  # as another training would leave another one
     old = log.read_bytes()
     log.write_bytes(old + b'{"step": 2, "loss": 1.0}\n')
-    stages.main(TINY, workdir)
+    run.main(TINY, workdir)
     assert "evaluate: again, because models/mvae has changed since\n" in capsys.readouterr().err
     log.write_bytes(old)
-    stages.main(TINY, workdir)
+    run.main(TINY, workdir)
     assert metrics.read_text() == before[0]
 
 
 def test_another_configuration_is_refused(workdir):
     other = dataclasses.replace(TINY, steps=(3, 2, 2, 2))
     with pytest.raises(ValueError, match=r"config\.json was made with steps = \[2, 2, 2, 2\]"):
-        stages.main(other, workdir)
+        run.main(other, workdir)
 
 
 def test_the_documented_calls_run(workdir):

@@ -9,7 +9,7 @@ from PIL import Image
 
 import sts_jax as sts
 from experiments import fit, objects, sense, show
-from experiments.shared import output
+from experiments.shared import drawing
 
 
 def forbidden(*_, **__):
@@ -60,35 +60,35 @@ def test_a_folder_that_cannot_be_written_is_refused_before_any_work(tmp_path, mo
 
 
 def test_a_path_that_can_be_written_leaves_no_trace(tmp_path):
-    output.check_picture(tmp_path / "a.PNG")
+    drawing.check_picture(tmp_path / "a.PNG")
     assert not list(tmp_path.iterdir())
     (tmp_path / "old.jpg").write_bytes(b"old")
-    output.check_picture(tmp_path / "old.jpg")
+    drawing.check_picture(tmp_path / "old.jpg")
     assert (tmp_path / "old.jpg").read_bytes() == b"old"
-    output.make_folder(tmp_path / "a" / "b")
+    drawing.make_folder(tmp_path / "a" / "b")
     assert not list((tmp_path / "a" / "b").iterdir())
 
 
 @pytest.mark.parametrize(("name", "form"), [("a.png", "PNG"), ("a.JPG", "JPEG"), ("a.webp", "WEBP"), ("a.tif", "TIFF")])
 def test_pictures_and_figures_have_the_format_of_their_suffix(name, form, tmp_path):
-    output.write_picture(tmp_path / name, Image.new("RGB", (6, 4)))
-    output.write_figure(tmp_path / f"figure-{name}", Figure(figsize=(1, 0.5)), dpi=40)
+    drawing.write_picture(tmp_path / name, Image.new("RGB", (6, 4)))
+    drawing.write_figure(tmp_path / f"figure-{name}", Figure(figsize=(1, 0.5)), dpi=40)
     for path, size in ((tmp_path / name, (6, 4)), (tmp_path / f"figure-{name}", (40, 20))):
         with Image.open(path) as picture:
             assert (picture.format, picture.size) == (form, size)
 
 
 def test_a_pdf_and_a_figure_without_suffix_are_written(tmp_path):
-    output.write_picture(tmp_path / "a.pdf", Image.new("RGB", (6, 4)))
-    output.write_figure(tmp_path / "b.pdf", Figure(), dpi=40)
-    output.write_figure(tmp_path / "c", Figure(), dpi=40)
+    drawing.write_picture(tmp_path / "a.pdf", Image.new("RGB", (6, 4)))
+    drawing.write_figure(tmp_path / "b.pdf", Figure(), dpi=40)
+    drawing.write_figure(tmp_path / "c", Figure(), dpi=40)
     starts = [(tmp_path / name).read_bytes()[:4] for name in ("a.pdf", "b.pdf", "c")]
     assert starts == [b"%PDF", b"%PDF", b"\x89PNG"]
 
 
 WRITERS = {
-    "picture": lambda path: output.write_picture(path, Image.new("RGB", (6, 4))),
-    "figure": lambda path: output.write_figure(path, Figure(), dpi=40),
+    "picture": lambda path: drawing.write_picture(path, Image.new("RGB", (6, 4))),
+    "figure": lambda path: drawing.write_figure(path, Figure(), dpi=40),
 }
 
 

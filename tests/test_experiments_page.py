@@ -7,7 +7,7 @@ import pytest
 from extending_page import blocks
 
 from experiments import freefall
-from experiments.shared import stages
+from experiments.shared import run
 
 SMALLER = (
     ("num_objects=400,", "num_objects=12,"),
@@ -36,7 +36,7 @@ def test_the_code_of_the_page_trains_both_kinds_of_models_as_the_experiments_do(
     data = names["data"]
     falls = data.ends(data.members("train", rendered=False))
     pairs = data.pairs(data.members("train"), symmetries=True)
-    (job,) = stages.jobs(config, names["sensor"], pairs, data.views("train"), falls)
+    (job,) = run.jobs(config, names["sensor"], pairs, data.views("train"), falls)
     assert job.model == names["model"]
     assert job.preprocessing == names["preprocessing"]
     assert job.arrays.checksum() == names["arrays"].checksum()

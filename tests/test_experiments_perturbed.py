@@ -12,7 +12,7 @@ import sts_jax as sts
 from benchmarks import deterministic, recognise, scaling
 from benchmarks.instruments.experiments import EXPERIMENTS
 from experiments import perturbed, show
-from experiments.shared import stages
+from experiments.shared import run
 from sts_jax import dataset, evaluation, physics
 
 pytestmark = pytest.mark.slow
@@ -39,7 +39,7 @@ TINY = dataclasses.replace(
 @pytest.fixture(scope="module")
 def workdir(tmp_path_factory):
     workdir = tmp_path_factory.mktemp("runs") / "perturbed"
-    stages.main(TINY, workdir)
+    run.main(TINY, workdir)
     return workdir
 
 

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from experiments.shared.table2_command import Train
 from recorded_session import record
 
 import sts_jax as sts
 from experiments import real
-from experiments.shared import recorded, results, table2
+from experiments.shared import evaluate, recorded, table2
 from experiments.shared.collecting import Collect
 from experiments.shared.config import MODELS
-from experiments.shared.table2_command import Train
 from sts_jax import hardware, training
 
 TINY = dataclasses.replace(real.SMOKE, steps=(1, 1, 1), count=6, shifts=1, largest_shift=3)
@@ -141,13 +141,13 @@ def test_the_models_are_trained_judged_and_resumed_on_a_device_without_adding_tr
     bce = -(target * np.log(guess) + (1 - target) * np.log1p(-guess)).mean()
     assert numbers["visual"]["predictors"]["VAE visual only"]["bce"]["value"] == pytest.approx(bce, rel=1e-4)
 
-    identities = {name: results.identity(work / "table2" / "models" / name) for name in recorded.NAMES}
+    identities = {name: evaluate.identity(work / "table2" / "models" / name) for name in recorded.NAMES}
     written = (work / "table2" / "metrics.json").stat().st_mtime_ns
     real.main(Train(TINY, work))
     assert (work / "table2" / "metrics.json").stat().st_mtime_ns == written
     (work / "table2" / "table.md").unlink()
     assert table2.evaluate(TINY, images, work, work / "table2") in table
-    assert identities == {name: results.identity(work / "table2" / "models" / name) for name in recorded.NAMES}
+    assert identities == {name: evaluate.identity(work / "table2" / "models" / name) for name in recorded.NAMES}
 
     hardware.discard_recording(work / "dataset", 2)
     with pytest.raises(SystemExit, match=r"table2/config.json was made with trajectories.*choose another folder"):

@@ -9,7 +9,7 @@ from extending_page import blocks
 from test_evaluation_scores import judged
 
 from experiments import freefall
-from experiments.shared import config, stages
+from experiments.shared import config, run
 from sts_jax import dataset, evaluation, physics, training
 
 
@@ -152,7 +152,7 @@ def test_another_image_size_goes_through_every_stage(model, side, size, tmp_path
         num_samples=2,
         rerolls=2,
     )
-    stages.main(tiny, tmp_path)
+    run.main(tiny, tmp_path)
     predictors = json.loads((tmp_path / "metrics.json").read_text())["predictors"]
     assert predictors["constant (mean training target)"]["visual_skill"]["value"] == 0
     trained = [own for name, own in predictors.items() if "from visual" in name]

@@ -9,8 +9,8 @@ from extending_page import blocks
 
 import sts_jax as sts
 from experiments import freefall, inclined
-from experiments.shared import stages
-from experiments.shared.extensions import Extensions
+from experiments.shared import run
+from experiments.shared.config import Extensions
 from sts_jax import dataset, evaluation, physics
 
 
@@ -42,7 +42,7 @@ def test_the_code_of_the_page_runs_an_experiment_with_its_own_parts(tmp_path, ca
     names = {}
     exec("\n".join(blocks("A whole experiment with your own parts")), names)
     own, config = names["own"], tiny(freefall.SMOKE, physics.Freefall(frames=15))
-    stages.main(config, tmp_path, own=own)
+    run.main(config, tmp_path, own=own)
     logged = records(tmp_path / "models/statespace")
     assert all(record["penalty"] > 0 for record in logged)
     printed = capsys.readouterr().out
@@ -63,14 +63,14 @@ def test_the_code_of_the_page_runs_an_experiment_with_its_own_parts(tmp_path, ca
     assert summary[evaluation.ONE_REROLL]["farthest"]["value"] > 0
 
     written = (tmp_path / "metrics.json").stat().st_mtime_ns
-    stages.main(config, tmp_path, own=own)
+    run.main(config, tmp_path, own=own)
     assert (tmp_path / "metrics.json").stat().st_mtime_ns == written
     capsys.readouterr()
-    stages.main(config, tmp_path, only="evaluate")
+    run.main(config, tmp_path, only="evaluate")
     assert "again, because the list of metrics has changed" in "".join(capsys.readouterr())
     assert "farthest" not in json.loads((tmp_path / "metrics.json").read_text())["predictors"]["copy of the input"]
     with pytest.raises(ValueError, match=r"loss = 'given as loss='"):
-        stages.main(config, tmp_path, only="train")
+        run.main(config, tmp_path, only="train")
 
 
 @pytest.mark.slow
@@ -80,7 +80,7 @@ def test_an_experiment_trains_and_scores_a_further_modality(tmp_path):
 
     force = dataset.Measurement("force", (3,), forces, unit="N")
     config = tiny(inclined.SMOKE, physics.Inclined(frames=15), model="paper")
-    stages.main(config, tmp_path, own=Extensions(measurements=(force,)))
+    run.main(config, tmp_path, own=Extensions(measurements=(force,)))
     assert sts.Predictor.load(tmp_path / "models/mvae").modalities == ("visual", "tactile", "pose", "force")
     assert sts.Predictor.load(tmp_path / "models/vae-visual").modalities == ("visual",)
     data = dataset.load(tmp_path / "dataset")
@@ -92,13 +92,13 @@ def test_an_experiment_trains_and_scores_a_further_modality(tmp_path):
     assert summary["VAE visual only, from visual"]["force_error"] is None
     assert "force error (N)" in (tmp_path / "table-full.md").read_text()
     with pytest.raises(ValueError, match=r"names in measurements are .*mvae was trained with \['force'\]"):
-        stages.main(config, tmp_path, only="evaluate")
+        run.main(config, tmp_path, only="evaluate")
 
 
 def test_a_further_modality_of_a_state_space_model_is_refused_before_anything_is_collected(tmp_path):
     force = dataset.Measurement("force", (3,), lambda data, rows: None)
     with pytest.raises(ValueError, match="measurements must be empty for model='statespace', got the modality 'force'"):
-        stages.main(freefall.SMOKE, tmp_path / "run", own=Extensions(measurements=(force,)))
+        run.main(freefall.SMOKE, tmp_path / "run", own=Extensions(measurements=(force,)))
     assert not (tmp_path / "run").exists()
 
 

@@ -15,7 +15,7 @@ from PIL import Image
 
 import sts_jax as sts
 from experiments import perturbed
-from experiments.shared import stages
+from experiments.shared import run
 from sts_jax import dataset, evaluation, geometry, physics
 
 ENGINES = ["mujoco", pytest.param("mjx", marks=pytest.mark.slow)]
@@ -214,7 +214,7 @@ def test_the_stages_of_an_experiment_train_and_evaluate_a_new_scenario(page, nam
         num_samples=2,
         rerolls=2,
     )
-    stages.main(config, tmp_path)
+    run.main(config, tmp_path)
     summary = json.loads((tmp_path / "metrics.json").read_text())
     assert set(summary["outcomes"]) <= {outcome.name.lower() for outcome in scenario.outcomes}
     assert sum(summary["outcomes"].values()) == summary["items"]

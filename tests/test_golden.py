@@ -38,9 +38,9 @@ def test_an_image_is_rendered_as_before():
 @pytest.mark.slow
 def test_a_whole_small_run_gives_the_same_shards_losses_and_metrics(tmp_path):
     from experiments import freefall
-    from experiments.shared import stages
+    from experiments.shared import run
 
-    stages.main(freefall.SMOKE, tmp_path)
+    run.main(freefall.SMOKE, tmp_path)
     golden, found = json.loads((make.HERE / "smoke.json").read_text()), make.smoke(tmp_path)
     moved = np.abs(np.array(found["ends"]) - golden["ends"]).max((1, 2))
     assert np.median(moved) < 1e-4

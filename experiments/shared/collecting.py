@@ -7,10 +7,9 @@ from pathlib import Path
 
 import sts_jax as sts
 from experiments.shared import simulated
-from experiments.shared.command import Folder
 from experiments.shared.page import Page
-from experiments.shared.progress import say
-from experiments.shared.terminal import Terminal, single_keys
+from experiments.shared.run import Folder
+from experiments.shared.terminal import Terminal, say, single_keys
 from sts_jax import hardware, storage
 from sts_jax.hardware import AutomaticPerson, EmptyPad, GuideConfig, Person, View
 

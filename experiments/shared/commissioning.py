@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Literal
 
 import sts_jax as sts
-from experiments.shared import backgrounds, boards, output
-from experiments.shared.command import Folder
+from experiments.shared import backgrounds, boards, drawing
+from experiments.shared.run import Folder
 from sts_jax import hardware, storage
 
 FRAME_SHARE = 0.9  # longest exposure as a share of the time between two frames
@@ -78,7 +78,7 @@ def check(config: Config) -> None:
             f"--board-images is {config.board_images}, but this is not a folder: give a folder with pictures of the "
             "board"
         )
-    output.make_folder(config.out)
+    drawing.make_folder(config.out)
 
 
 @contextlib.contextmanager

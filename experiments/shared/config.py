@@ -1,14 +1,16 @@
-"""The configuration of an experiment, and its presets."""
+"""The configuration of an experiment, its presets, its checks, and one split of it in a work directory."""
 
 import dataclasses
 import itertools
+from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+import optax
 
 import sts_jax as sts
-from sts_jax import dataset, evaluation, statespace, training
+from sts_jax import dataset, evaluation, mvae, statespace, training
 from sts_jax.dataset.collection import PARTS
 from sts_jax.training import TrainConfig
 
@@ -63,6 +65,104 @@ class Config:
     rerolls: int = 16
     num_rerolled: int = 256  # number of held-out starts that are re-rolled, from the first one on
 
+    @property
+    def schedule(self) -> TrainConfig:
+        """The training options of the models that the experiment trains."""
+        return self.state_training if self.model == "statespace" else self.training
+
+    @property
+    def preprocessing(self) -> training.Preprocessing:
+        """The preprocessing of the models' inputs."""
+        return training.Preprocessing(
+            self.collection.resolution if self.model == "statespace" else (self.image_size, self.image_size),
+            self.collection.crop,
+            rotation=self.rotation,
+            mask_blank_touch=self.mask_blank_touch,
+            condition_scale=self.collection.scenario.condition_scale,
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """One split of an experiment in its work directory. Files of the first split have no suffix."""
+
+    config: Config
+    workdir: Path
+    sensor: sts.Sensor
+    split: str  # one of `config.splits`
+
+    @property
+    def suffix(self) -> str:
+        """End of the names of the split's files and models, such as `-by-trajectory`."""
+        return "" if self.split == self.config.splits[0] else f"-by-{self.split}"
+
+    @property
+    def main_model(self) -> str:
+        """Name of the model that the main table and the figures show."""
+        return next(iter(MODELS[self.config.model]))
+
+    @property
+    def figures(self) -> Path:
+        """Folder of the figures."""
+        return self.workdir / f"figures{self.suffix}"
+
+    def folder(self, model: str) -> Path:
+        """Folder of a model."""
+        return self.workdir / "models" / f"{model}{self.suffix}"
+
+
+Log = Callable[[int, dict[str, float]], None]  # arguments: step of a record, other numbers of the record by name
+
+
+@dataclasses.dataclass(frozen=True)
+class Extensions:
+    """Your own loss, optimiser, logger, metrics, table columns and modalities for an experiment.
+
+    A field that you do not set selects the library's own part. Functions cannot be compared: after a change of the loss
+    or the optimiser, use a new work directory, and after a change of a metric's function, rename the metric.
+    """
+
+    # Function that receives the configuration of a model, and returns the loss for it
+    loss: Callable[[mvae.Config | statespace.Config], training.Loss] | None = None
+    # Optimiser of all models, in place of Adam with the options of the configuration
+    optimiser: optax.GradientTransformation | None = None
+    # JSON values that describe the loss and the optimiser. They are stored with each model, and a resumed training must
+    # have the same notes
+    notes: dict[str, Any] | None = None
+    # Function that receives the name of a model, and returns the argument `log` of `training.train` for it
+    log: Callable[[str], Log] | None = None
+    metrics: tuple[evaluation.Metric, ...] = evaluation.METRICS  # metrics of metrics.json and table-full.md
+    columns: tuple[evaluation.Column, ...] = evaluation.COLUMNS  # columns of table.md
+    # Further modalities of the paper's model with all modalities (`--model paper`). Their errors are further metrics
+    measurements: tuple[dataset.Measurement, ...] = ()
+
+    def __post_init__(self) -> None:
+        names = [metric.name for metric in self.scored]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"metrics has more than one metric named {name!r}: give each metric its own name")
+        for column in self.columns:
+            for metric in column.metrics:
+                if metric.name not in names:
+                    raise ValueError(
+                        f"the column {column.heading!r} has the metric {metric.name!r}, which is not among the metrics "
+                        f"({', '.join(map(repr, names))}): add it to the field `metrics`, or leave out the column"
+                    )
+
+    @property
+    def scored(self) -> tuple[evaluation.Metric, ...]:
+        """All metrics: those of the field `metrics`, and the error of each modality in `measurements`."""
+        return (*self.metrics, *(evaluation.measurement_error(one) for one in self.measurements))
+
+    def described(self) -> list[Any]:
+        """All metrics, table columns and modalities as JSON values that can be compared."""
+        fields = [{name: str(x) for name, x in vars(metric).items() if not callable(x)} for metric in self.scored]
+        columns = [[column.heading, [metric.name for metric in column.metrics]] for column in self.columns]
+        return [fields, columns, [[one.name, one.shape, float(one.scale)] for one in self.measurements]]
+
+
+NONE = Extensions()
+
 
 # The same for all scenarios. The presets set `steps`.
 STATE_TRAINING = TrainConfig(
@@ -78,26 +178,22 @@ STATE_TRAINING = TrainConfig(
 
 def smoke(default: Config) -> Config:
     """Reduce a configuration to a short experiment that runs every stage, for tests."""
-    collection = dataclasses.replace(
-        default.collection,
-        num_objects=16,
-        num_per_object=2,
-        num_rendered=None,
-        num_full=4,
-        objects_per_shard=8,
-        symmetries=False,
-        shares=(0.7, 0.1, 0.2),
-        seed=0,
-    )
-    schedule = dataclasses.replace(default.training, batch_size=8, log_every=2, checkpoint_every=4)
-    state = dataclasses.replace(
-        default.state_training, steps=8, warmup=0, batch_size=8, log_every=2, checkpoint_every=4
-    )
+    short = {"batch_size": 8, "log_every": 2, "checkpoint_every": 4}
     return dataclasses.replace(
         default,
-        collection=collection,
-        training=schedule,
-        state_training=state,
+        collection=dataclasses.replace(
+            default.collection,
+            num_objects=16,
+            num_per_object=2,
+            num_rendered=None,
+            num_full=4,
+            objects_per_shard=8,
+            symmetries=False,
+            shares=(0.7, 0.1, 0.2),
+            seed=0,
+        ),
+        training=dataclasses.replace(default.training, **short),
+        state_training=dataclasses.replace(default.state_training, steps=8, warmup=0, **short),
         steps=(8, 8, 8, 8),
         rerolls=4,
         num_samples=4,
@@ -105,15 +201,7 @@ def smoke(default: Config) -> Config:
 
 
 def paper(collection: dataset.Collection, *, num_objects: int, num_per_object: int) -> Config:
-    """Make the configuration with the models, the training schedule and the options of the paper.
-
-    All frames of all trajectories are rendered.
-
-    Args:
-        collection: Settings for the data of the default experiment, such as the scenario and the object classes.
-        num_objects: Number of objects.
-        num_per_object: Number of trajectories of each object.
-    """
+    """The models, the training schedule and the options of the paper, for the scenario and classes of a collection."""
     return Config(
         collection=dataclasses.replace(
             collection,
@@ -138,12 +226,8 @@ def paper(collection: dataset.Collection, *, num_objects: int, num_per_object: i
     )
 
 
-def check(config: Config) -> None:
-    """Check the fields that later stages need, so that a mistake is found before the dataset is collected.
-
-    Raises:
-        ValueError: A field is out of range, or two fields contradict each other. The message names the remedy.
-    """
+def check(config: Config, own: Extensions = NONE) -> None:
+    """Find a mistake in the configuration before the dataset is collected."""
     collection, names = config.collection, tuple(MODELS["paper"])
     collection.check(sts.Sensor())
     height, width = collection.resolution
@@ -175,9 +259,7 @@ def check(config: Config) -> None:
             f"steps must have one number for each model ({', '.join(names)}), got {config.steps}: change --steps, or "
             "give --steps None to train each model for --training.epochs epochs"
         )
-    trained, option = (
-        (config.state_training, "state_training") if config.model == "statespace" else (config.training, "training")
-    )
+    trained, option = config.schedule, "state_training" if config.model == "statespace" else "training"
     if trained.schedule == "cosine" and trained.steps is not None and trained.warmup >= trained.steps:
         raise ValueError(
             f"{option}.warmup must be smaller than {option}.steps ({trained.steps}), got {trained.warmup}: give "
@@ -186,18 +268,23 @@ def check(config: Config) -> None:
     for name in ("num_shown", "num_samples", "rerolls", "num_rerolled"):
         if getattr(config, name) < 1:
             raise ValueError(f"{name} must be >= 1, got {getattr(config, name)}")
-    unknown = [split for split in config.splits if split not in SPLITS]
-    if unknown or not config.splits:
+    if not config.splits or not set(config.splits) <= set(SPLITS):
         raise ValueError(
             f"splits must be one or more of {', '.join(SPLITS)}, got {config.splits}: give --splits "
             f"{SPLITS[0]}, for example"
         )
     for split in config.splits:
         _check_parts(collection, split)
+    if own.measurements and config.model != "paper":
+        raise ValueError(
+            f"measurements must be empty for model={config.model!r}, got the modality {own.measurements[0].name!r}: "
+            "remove it, or use model='paper', because only the paper's model `mvae` accepts modalities in addition to "
+            "visual, tactile and pose"
+        )
 
 
 def _check_parts(collection: dataset.Collection, split: str) -> None:
-    """Raise a `ValueError` unless each part of a split of the dataset contains at least one object or trajectory."""
+    """Raise a `ValueError` unless each part of a split has at least one object or trajectory."""
     shares, count = np.array(collection.shares), collection.num_objects
     parts: tuple[str, ...] = PARTS
     items, few = "objects", f"collection.num_objects is {count}"
@@ -246,23 +333,3 @@ def _fits(model: Literal["statespace", "paper"], side: int, size: int) -> bool:
     except ValueError:
         return False
     return True
-
-
-def model_folder(workdir: Path, name: str, config: Config, split: str) -> Path:
-    """The folder of a model that was trained on data split by object or by trajectory.
-
-    The argument `split` is "object" if whole objects are held out from the training, and "trajectory" if random
-    trajectories are held out. The folder is `models/NAME` if `split` is the first entry of `config.splits`, and
-    `models/NAME-by-SPLIT` otherwise.
-    """
-    return workdir / "models" / (name if split == config.splits[0] else f"{name}-by-{split}")
-
-
-def main_model(config: Config) -> str:
-    """The name of the model that the main table and the figures show."""
-    return next(iter(MODELS[config.model]))
-
-
-def schedule(config: Config) -> TrainConfig:
-    """The training options of the models that the experiment trains."""
-    return config.state_training if config.model == "statespace" else config.training

@@ -1,82 +1,119 @@
-"""Draws the figures of an evaluation."""
+"""Pictures: checks of output paths, atomic writing, the figures of an evaluation, and trajectories from outside."""
 
+import io
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
+from matplotlib.figure import Figure
+from PIL import Image
 
 import sts_jax as sts
-from experiments.shared.config import TITLES, Config, main_model
-from experiments.shared.rerolls import Ceilings
-from sts_jax import dataset, evaluation
+from experiments.shared.config import TITLES, Run
+from sts_jax import dataset, evaluation, storage
 
+PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".pdf")  # formats that Pillow and Matplotlib write
 JUDGED_SUBSETS = ("visual", "visual and tactile", "all inputs")  # inputs for which outcome probabilities are drawn
 
 
+def check_picture(path: Path) -> None:
+    """Check before any work that a picture can be written to a path."""
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a folder: give the name of a picture, such as {path / 'picture.png'}")
+    if path.suffix.lower() not in PICTURES:
+        raise ValueError(f"{path} has the suffix {path.suffix!r}, but it must be one of {', '.join(PICTURES)}")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(
+            f"the folder {path.parent} of {path.name} does not exist: make this folder, or give another path"
+        )
+    _try_to_write(path.parent)
+    if path.exists():
+        try:
+            path.open("ab").close()
+        except OSError as error:
+            raise type(error)(f"{path} cannot be overwritten ({error.strerror}): give another path") from error
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder if it does not exist, and check that it can be written to."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise type(error)(f"the folder {path} cannot be made ({error.strerror}): give another path") from error
+    _try_to_write(path)
+
+
+def _try_to_write(folder: Path) -> None:
+    try:
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise type(error)(f"the folder {folder} cannot be written to ({error.strerror}): give another path") from error
+
+
+def write_picture(path: Path, picture: Image.Image) -> None:
+    """Write a picture atomically, in the format of the suffix, which is one of `PICTURES`."""
+    buffer = io.BytesIO()
+    picture.save(buffer, Image.registered_extensions()[path.suffix.lower()])
+    storage.write_bytes(path, buffer.getvalue())
+
+
+def write_figure(path: Path, figure: Figure, *, dpi: float) -> None:
+    """Write a figure atomically, in the format of the suffix, or as PNG without one."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=path.suffix[1:] or "png", dpi=dpi)
+    storage.write_bytes(path, buffer.getvalue())
+
+
 def draw(
-    config: Config,
-    workdir: Path,
-    figures: Path,
-    sensor: sts.Sensor,
+    run: Run,
     test: dataset.Pairs,
     scores: Mapping[str, evaluation.Scores],
     shown: Mapping[str, evaluation.Predicted],
-    possible: Ceilings,
+    rerolled: np.ndarray,
 ) -> list[Path]:
-    """Draw the main model's predictions from vision and from all inputs, and the calibration of outcome probabilities.
-
-    The main model is the model that the main table of results shows. If it predicts samples of the pose, further
-    figures show the predicted and the re-rolled positions at rest. A re-roll is another simulation from the same
-    initial state, with new random hidden properties such as friction.
+    """Draw the main model's predictions, the calibration of its outcomes, and its sampled positions at rest.
 
     Args:
-        config: Configuration of the experiment.
-        workdir: Work directory. Its name is part of the titles.
-        figures: Folder for the figures.
-        sensor: Sensor of the collection.
+        run: The split of the experiment.
         test: Held-out trajectories.
-        scores: Scores of the predictions. The keys are the titles of the rows in the tables.
-        shown: Predictions of the first held-out trajectories. The keys are the titles of the rows.
-        possible: Re-rolls of the first held-out trajectories.
+        scores: Scores of the predictions, by the titles of the tables' rows.
+        shown: Predictions of the first held-out trajectories, by the same titles.
+        rerolled: Poses at rest of the re-rolls of the first held-out trajectories, shape (times, n, 7).
 
     Returns:
         Paths of the figures.
     """
-    drawn, model, scenario = [], TITLES[main_model(config)], config.collection.scenario
+    config, name = run.config, run.workdir.name
+    drawn, model = [], TITLES[run.main_model]
     num_shown = min(config.num_shown, len(test.object))
-    for given, name in (("visual", "predictions"), ("all inputs", "predictions-all")):
-        found = shown.get(f"{model}, from {given}")
-        if found is None:
+    for given, stem in (("visual", ""), ("all inputs", "-all")):
+        predicted = shown.get(f"{model}, from {given}")
+        if predicted is None:
             continue
-        title = f"{workdir.name}, from {given}: the first {num_shown} held-out trajectories"
-        drawn.append(figures / f"{name}.png")
-        evaluation.figures.predictions(drawn[-1], test, found, num=num_shown, title=title, scenario=scenario)
-        if found.samples is not None and found.samples.pose is not None:
-            drawn.append(figures / f"{name.replace('predictions', 'ends')}.png")
-            head = f"{workdir.name}, from {given}"
-            _ends(drawn[-1], head, sensor, test, found.samples.pose, possible.pose[:, : config.num_shown])
+        title = f"{name}, from {given}: the first {num_shown} held-out trajectories"
+        drawn.append(run.figures / f"predictions{stem}.png")
+        evaluation.figures.predictions(
+            drawn[-1], test, predicted, num=num_shown, title=title, scenario=config.collection.scenario
+        )
+        if predicted.samples is not None and predicted.samples.pose is not None:
+            drawn.append(run.figures / f"ends{stem}.png")
+            _draw_ends(
+                drawn[-1], f"{name}, from {given}", run.sensor, test, predicted.samples.pose, rerolled[:, :num_shown]
+            )
     judged = {f"from {given}": scores.get(f"{model}, from {given}") for given in JUDGED_SUBSETS}
-    known = {given: own for given, own in judged.items() if own is not None and own.confidence is not None}
-    if known:
-        drawn.append(figures / "calibration.png")
-        title = f"{workdir.name}: outcome probabilities of {model}"
-        evaluation.figures.calibration(drawn[-1], known, title=title)
+    judged = {given: one for given, one in judged.items() if one is not None and one.confidence is not None}
+    if judged:
+        drawn.append(run.figures / "calibration.png")
+        evaluation.figures.calibration(drawn[-1], judged, title=f"{name}: outcome probabilities of {model}")
     return drawn
 
 
-def _ends(
+def _draw_ends(
     path: Path, head: str, sensor: sts.Sensor, test: dataset.Pairs, sampled: np.ndarray, rerolled: np.ndarray
 ) -> None:
-    """Draw the positions at rest for the start whose re-rolls have the widest spread.
-
-    Args:
-        path: Path of the figure.
-        head: Begin of the title.
-        sensor: Sensor of the collection.
-        test: Held-out trajectories.
-        sampled: Sampled poses at rest, shape (samples, n, 7).
-        rerolled: Poses at rest of the re-rolls, shape (times, n, 7).
-    """
+    """Draw sampled and re-rolled positions at rest for the start whose re-rolls have the widest spread."""
     spread = np.linalg.norm(rerolled[..., :2] - rerolled[..., :2].mean(0), axis=-1).mean(0)
     item = int(spread.argmax())
     evaluation.figures.ends(
@@ -89,3 +126,57 @@ def _ends(
         title=f"{head}: ends of #{test.trajectory[item]}, the start with the widest spread among the first "
         f"{len(spread)}",
     )
+
+
+def draw_strip(path: Path, collection: dataset.Collection, sensor: sts.Sensor, data: dataset.Dataset) -> None:
+    """Draw a fully rendered trajectory as a strip of pictures: the first one of the first outcome of the scenario."""
+    full = data.full_trajectories()
+    rank = [collection.scenario.outcomes.index(o) for o in data.trajectory["outcome"][full]]
+    index = int(full[np.argmin(rank)])
+    one, hidden = ({name: leaf[index] for name, leaf in x.items()} for x in (data.trajectory, data.hidden))
+    images = data.strip(index)
+    body = dataset.make_bodies(collection, np.array([one["body"]]))[0]
+    what = describe(collection.scenario, dataset.class_names(collection)[one["body"]], one, hidden)
+    evaluation.figures.strip(
+        path,
+        one["time"],
+        views(body, one["pose"], one["gravity"], sensor, collection.scenario.wall),
+        images.visual / 255,
+        images.tactile / 255,
+        one["wrench"],
+        title=f"trajectory {index}: {what}",
+    )
+
+
+def views(body: sts.objects.Body, pose: np.ndarray, gravity: np.ndarray, sensor: sts.Sensor, wall: float) -> np.ndarray:
+    """Render the object and the pad obliquely from above, for each frame of a trajectory.
+
+    The final direction of gravity points down in the pictures. An object that has left the pad is drawn while it moves.
+
+    Args:
+        body: The object.
+        pose: Poses, shape (frames, 7).
+        gravity: Gravity in the sensor frame (m/s^2), shape (frames, 3).
+        sensor: Sensor, whose pad is drawn.
+        wall: Height of the stop wall (m), 0 for none.
+
+    Returns:
+        Pictures of shape (frames, height, width, 3) in [0, 1].
+    """
+    size, up = jnp.array(sensor.gel.size), -jnp.asarray(gravity[-1])
+    frozen = np.append(False, (pose[1:] == pose[:-1]).all(1)) & np.asarray(sts.physics.fell_off(jnp.asarray(pose)))
+    pose = np.where(frozen[:, None], np.array([0, 0, -10, 1, 0, 0, 0], np.float32), pose)
+    return np.stack([np.asarray(evaluation.outside(body, jnp.asarray(each), size, up, wall)) for each in pose])
+
+
+def describe(
+    scenario: sts.physics.Scenario, name: str, trajectory: Mapping[str, np.ndarray], hidden: Mapping[str, np.ndarray]
+) -> str:
+    """Describe a trajectory in words: class, outcome, hidden properties and condition."""
+    words = [f"a {name} {scenario.named(int(trajectory['outcome']))}"]
+    words += [f"{key.replace('_', ' ')} {hidden[key]:.2f}" for key in ("fill", "shell_scale", "friction")]
+    if hidden["up"][2] < 1:
+        words.append("contents' up ({:.1f}, {:.1f}, {:.1f})".format(*hidden["up"]))
+    if len(trajectory["condition"]):
+        words.append(scenario.described(trajectory["condition"]))
+    return ", ".join(words)

@@ -12,7 +12,7 @@ import tyro
 from scipy.spatial.transform import Rotation
 
 import sts_jax as sts
-from experiments.shared import output
+from experiments.shared import drawing
 
 G = 9.81  # gravity (m/s^2)
 FILL = 0.5  # share of a container's interior that is filled
@@ -72,7 +72,7 @@ def check(config: Config) -> None:
     for name, value in (("mass", config.mass), ("force", config.force)):
         if value is not None and (value < 0 or (name == "mass" and value == 0)):
             raise ValueError(f"--{name} is {value}, but it must be " + (">= 0 (N)" if name == "force" else "> 0 (kg)"))
-    output.check_picture(config.out)
+    drawing.check_picture(config.out)
 
 
 def read(config: Config, name: str) -> sts.objects.Body:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from experiments.shared import output
+from experiments.shared import drawing
 from experiments.shared.live import Seen
 
 VIDEOS = (".mp4", ".mkv", ".avi")
@@ -83,11 +83,11 @@ class PanelFile:
         self._path = path
         self._is_video = path.suffix.lower() in VIDEOS
         if self._is_video:
-            output.make_folder(path.parent)
-        elif path.suffix.lower() in output.PICTURES:
-            output.check_picture(path)
+            drawing.make_folder(path.parent)
+        elif path.suffix.lower() in drawing.PICTURES:
+            drawing.check_picture(path)
         else:
-            known = ", ".join((*output.PICTURES, *VIDEOS))
+            known = ", ".join((*drawing.PICTURES, *VIDEOS))
             raise ValueError(f"--save is {path}, but its suffix must be one of {known}")
         self._panels: list[np.ndarray] = []  # panels of which the picture shows some
         self._writer: cv2.VideoWriter | None = None
@@ -125,5 +125,5 @@ class PanelFile:
         elif self._panels:
             chosen = np.unique(np.linspace(0, len(self._panels) - 1, _ROWS).round().astype(int))
             picture = Image.fromarray(np.vstack([self._panels[index] for index in chosen]))
-            output.write_picture(self._path, picture)
+            drawing.write_picture(self._path, picture)
         return self._writer is not None or bool(self._panels)

@@ -9,9 +9,9 @@ from pathlib import Path
 import cv2
 from PIL import Image, ImageDraw, ImageFont
 
-from experiments.shared import output
-from experiments.shared.command import Folder
-from experiments.shared.progress import say
+from experiments.shared import drawing
+from experiments.shared.run import Folder
+from experiments.shared.terminal import say
 from sts_jax import hardware
 
 SHEET = 20  # number of trajectories, the newest ones, that `--sheet` draws by default
@@ -45,7 +45,7 @@ def review(config: Review) -> None:
     """
     folder = config.workdir / "dataset"
     if config.sheet is not None:
-        output.check_picture(config.sheet)
+        drawing.check_picture(config.sheet)
     for number in config.restore:
         hardware.restore_recording(folder, number)
     for number in config.confirm:
@@ -117,4 +117,4 @@ def draw(folder: Path, numbers: tuple[int, ...], path: Path) -> None:
         pen.text((6, head + row * (height + 4) + height // 2 - 8), str(number), fill="black", font=font)
         for column, image in enumerate(images):
             sheet.paste(Image.fromarray(image), (margin + column * (PANEL + 4), head + row * (height + 4)))
-    output.write_picture(path, sheet)
+    drawing.write_picture(path, sheet)

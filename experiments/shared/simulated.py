@@ -12,7 +12,7 @@ import jax
 
 import sts_jax as sts
 from experiments.shared import backgrounds
-from experiments.shared.progress import Bar, say
+from experiments.shared.terminal import Bar, say
 from sts_jax import hardware, storage
 from sts_jax.hardware import EmptyPad, GuideConfig, View, twin
 

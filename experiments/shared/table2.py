@@ -1,114 +1,327 @@
-"""Evaluates the models of the paper's Table 2, and writes the table and a figure of predictions."""
+"""The paper's Table 2: reads recorded trajectories, trains three models on them, and evaluates these models."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
+import tyro
 
 import sts_jax as sts
-from experiments.shared import results, transfer
-from experiments.shared.config import TITLES
-from experiments.shared.progress import say
-from experiments.shared.recorded import NAMES, Config, Recorded
-from sts_jax import evaluation, storage
+from experiments.shared import simulated
+from experiments.shared.config import MODELS, TITLES
+from experiments.shared.evaluate import identity, record, stale
+from experiments.shared.run import Folder, Job, Stage, train_model
+from experiments.shared.terminal import Bar, say
+from sts_jax import evaluation, hardware, storage, training
 from sts_jax.evaluation import Predicted
-from sts_jax.training import records
+from sts_jax.hardware import SensorView, twin
+from sts_jax.predict import MODELS as SHIPPED
+from sts_jax.training import TrainConfig, records
 
-MVAE = "mvae-without-pose"
+NAMES = ("vae-visual", "vae-tactile", "mvae-without-pose")  # the rows of the paper's Table 2
+SIMULATED = "released"  # model of the library that was trained on simulated images only
+SIMULATED_TITLE = "state-space model, simulated training"
 FLOOR = "the truth itself (entropy)"
+LEAST = 5  # smallest number of trajectories, so that one of them can be held out
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Options to train and evaluate the models of the paper's Table 2 on recorded trajectories."""
+
+    training: TrainConfig  # options of the training
+    # number of trajectories that the digital twin collects if the work directory has none of a device
+    count: int = 100
+    size: tuple[int, int] = (640, 480)  # width and height of the twin's images (pixels)
+    # numbers of gradient steps, one for each of the three models. None: each is trained for training.epochs epochs
+    steps: tuple[int, int, int] | None = None
+    # modalities that the models learn to predict when only some modalities are given: all of them, or only the given
+    # ones (own, as in the paper)
+    targets: Literal["all", "own"] = "all"
+    # also train with the final pair as an input, so that the models learn that an object at rest stays at rest
+    rest: bool = True
+    shifts: int = 15  # number of shifted copies of each training trajectory
+    largest_shift: int = 8  # largest shift of a copy (pixels). In images of 64 pixels, one pixel is 2.3 mm wide
+    image_size: int = 64  # side of the images that are used and predicted (pixels). The paper uses 64
+    held_out: float = 0.2  # share of the trajectories for validation. The paper uses 0.2
+    seed: int = 0  # seed of the split into training and validation
+    num_shown: int = 6  # number of validation trajectories in the figure
+
+
+@dataclasses.dataclass(frozen=True)
+class Train:
+    """Train the models of the paper's Table 2 on recorded trajectories, and write the table.
+
+    The models are VAE visual only, VAE tactile only and MVAE without pose.
+    """
+
+    # configuration of the preset. Each of its fields is an option
+    config: Annotated[Config, tyro.conf.arg(name="")]
+    workdir: Folder = Path("runs/real")  # work directory with the folder `dataset` and the sensor file `sensor.json`
+    name: str = "table2"  # folder in the work directory for the results
+    preset: Literal["smoke", "default", "paper"] = "default"  # set of default values for the options
+    only: Stage | None = None  # run only this stage of the experiment
+    debug: bool = False  # show the traceback of every error
+
+
+class Recorded(NamedTuple):
+    """Recorded trajectories and images of the empty pad. All images are rectified to the view of `Sensor.camera`."""
+
+    train: hardware.RecordedImages  # training trajectories
+    validation: hardware.RecordedImages  # validation trajectories
+    empty: dict[str, np.ndarray]  # image of the empty pad for each stream, uint8 (size, size, 3)
+    identity: str  # checksum of the trajectories and the sensor file
+    source: str  # description of the sensor, for titles
+
+
+def main(args: Train) -> None:
+    """Collect trajectories of the digital twin if there are too few, train, evaluate, and print the table."""
+    config, workdir = args.config, args.workdir
+    check(config)
+    if args.name != Path(args.name).name or args.name in ("", "dataset"):
+        raise ValueError(f"--name must be the name of a folder, not a path and not 'dataset', got {args.name!r}")
+    sts.enable_compilation_cache()
+    if args.only in (None, "collect") and (count := missing(config, workdir)):
+        say(f"collect: {count} trajectories of the digital twin into {workdir / 'dataset'}")
+        simulated.collect(simulated.Simulated(workdir, config.count, config.size))
+    if args.only == "collect":
+        return
+    data, folder = read(config, workdir), workdir / args.name
+    with storage.lock(folder):
+        storage.claim(folder / "config.json", {**dataclasses.asdict(config), "trajectories": data.identity})
+        if args.only in (None, "train"):
+            for job in jobs(config, data):
+                train_model(job, folder / "models" / job.name, config.targets)
+        if args.only in (None, "evaluate"):
+            print(evaluate(config, data, workdir, folder))
+
+
+def check(config: Config) -> None:
+    """Check the fields of the configuration before any work."""
+    if not 0 < config.held_out < 1:
+        raise ValueError(f"held_out must be a share above 0 and below 1, got {config.held_out}")
+    if config.shifts < 0 or not 0 <= config.largest_shift < config.image_size:
+        raise ValueError(
+            f"shifts must be >= 0 and largest_shift must be 0 to {config.image_size - 1} pixels, got shifts = "
+            f"{config.shifts} and largest_shift = {config.largest_shift}"
+        )
+    if config.count < LEAST:
+        raise ValueError(f"count must be >= {LEAST}, got {config.count}")
+    if config.num_shown < 1:
+        raise ValueError(f"num_shown must be >= 1, got {config.num_shown}")
+    # This raises an error if no network exists for images of this size.
+    training.paper_model(("visual",), training.Preprocessing((config.image_size, config.image_size)))
+
+
+def missing(config: Config, workdir: Path) -> int:
+    """The number of trajectories that the digital twin still has to collect.
+
+    It is 0 if the trajectories come from a device, or from a twin that `python -m experiments.twin` ran.
+    """
+    if not (workdir / "dataset" / storage.MANIFEST).exists():
+        return config.count
+    recordings = hardware.load_recordings(workdir / "dataset")
+    return max(config.count - len(recordings), 0) if recordings.origin.camera == twin.CAMERA else 0
+
+
+def read(config: Config, workdir: Path) -> Recorded:
+    """Read the confirmed trajectories of a work directory, rectify the images, and hold out validation trajectories."""
+    recordings = hardware.load_recordings(workdir / "dataset")
+    device, sensor = sensor_file(workdir)
+    if len(recordings) < LEAST:
+        raise ValueError(
+            f"the number of confirmed trajectories in {recordings.folder} must be >= {LEAST}, got {len(recordings)}: "
+            "collect more, or confirm existing ones with `python -m experiments.real review --confirm NUMBER`"
+        )
+    size = (config.image_size, config.image_size)
+    with Bar() as bar:
+        images = hardware.recorded_images(
+            recordings,
+            device.lens,
+            sensor.camera,
+            size,
+            progress=lambda done, total: bar("read", done, total),
+        )
+    empty = {
+        stream: hardware.rectified(device.lens, sensor.camera, device.background(workdir, stream), size)
+        for stream in ("visual", "tactile")
+    }
+    order = np.random.default_rng(config.seed).permutation(len(recordings))
+    cut = min(max(round((1 - config.held_out) * len(order)), 1), len(order) - 1)
+    train, validation = (
+        hardware.RecordedImages(*(leaf[np.sort(rows)] for leaf in images)) for rows in (order[:cut], order[cut:])
+    )
+    # The serial number of a twin's LED controller begins with TWIN.
+    is_twin = recordings.origin.leds.startswith("TWIN")
+    source = "a digital twin" if is_twin else f"the sensor {recordings.origin.camera}"
+    # The sensor file has the checksums of the background images.
+    content = {"dataset": recordings.identity, "sensor": storage.sha256(workdir / "sensor.json")}
+    return Recorded(train, validation, empty, storage.digest(content), source)
+
+
+def sensor_file(workdir: Path) -> tuple[hardware.Device, sts.Sensor]:
+    """Read the sensor file of a work directory: the device, which must have backgrounds, and the constants."""
+    path = workdir / "sensor.json"
+    if not path.exists():
+        raise FileNotFoundError(
+            f"the sensor file {path} is missing: copy this file and the background images (images of the empty pad) "
+            "into the work directory. `python -m experiments.commission` writes these files"
+        )
+    device = hardware.Device.load(path)
+    if device.background_visual is None or device.background_tactile is None:
+        raise ValueError(
+            f"{path} names no background images (images of the empty pad), but they are needed to find contacts: run "
+            "`python -m experiments.commission` again, and copy the sensor file and its images into the work directory"
+        )
+    return device, sts.Sensor.load(path)
+
+
+def jobs(config: Config, data: Recorded) -> Iterator[Job]:
+    """Prepare the training of each of the three models."""
+    size, blank = (config.image_size, config.image_size), data.empty["tactile"]
+    preprocessing = training.touch_of_noisy_images(training.Preprocessing(size), data.train.tactile[:, 0], blank)
+    visual, tactile = (augmented(config, getattr(data.train, name), data.empty[name]) for name in ("visual", "tactile"))
+    for number, name in enumerate(NAMES):
+        modalities = MODELS["paper"][name]
+        arrays, completed = training.image_arrays(visual, tactile, modalities, preprocessing, blank)
+        if completed.absent:
+            raise ValueError(
+                "none of the initial tactile images for training shows a contact: draw the newest images with "
+                "`python -m experiments.real review --sheet review.png`, and compare them with the tactile background "
+                "image that sensor.json names"
+            )
+        schedule = config.training
+        if config.steps is not None:
+            schedule = dataclasses.replace(schedule, steps=config.steps[number])
+        yield Job(name, schedule, training.paper_model(modalities, completed), arrays, completed, data.empty)
+
+
+def augmented(config: Config, images: np.ndarray, empty: np.ndarray) -> np.ndarray:
+    """Add `config.shifts` shifted copies of image pairs, and copies in which the final image replaces the initial one.
+
+    Args:
+        config: Configuration of the experiment.
+        images: Initial and final images, all visual or all tactile, uint8 of shape (n, 2, size, size, 3).
+        empty: Image of the empty pad, uint8 of shape (size, size, 3).
+
+    Returns:
+        The given pairs, followed by the copies, uint8 of shape (samples, 2, size, size, 3).
+    """
+    random, far = np.random.default_rng(config.seed), config.largest_shift
+    parts = [images]
+    for _ in range(config.shifts):
+        parts.append(training.shifted(images, empty, random.integers(-far, far + 1, (len(images), 2))))
+    if config.rest:
+        parts += [part[:, [1, 1]] for part in parts]
+    return np.concatenate(parts)
 
 
 def evaluate(config: Config, data: Recorded, workdir: Path, folder: Path) -> str:
-    """Score the models on the validation trajectories, write the results, and return the table.
-
-    The results are `metrics.json`, `table.md` and `figures/`. `metrics.json` records the checksums of all inputs and
-    results. While all checksums match, nothing is evaluated again.
+    """Score the models on the validation trajectories, write the results, and return the table in Markdown.
 
     Args:
         config: Configuration of the experiment.
         data: Recorded trajectories.
         workdir: Work directory from which the trajectories were read.
-        folder: Folder with the trained models, which receives the results.
-
-    Returns:
-        The table in Markdown.
+        folder: Folder with the trained models, which receives `metrics.json`, `table.md`, `figures/` and the manifest.
     """
-    done, table = folder / "metrics.json", folder / "table.md"
+    metrics, table = folder / "metrics.json", folder / "table.md"
     models = {name: folder / "models" / name for name in NAMES}
     inputs = {"config.json": storage.digest(dataclasses.asdict(config)), "dataset": data.identity}
-    judged = {**models, transfer.NAME: transfer.FOLDER}
-    inputs |= {f"models/{name}": results.identity(path) for name, path in judged.items()}
-    reason = results.stale(done, inputs)
+    judged = {**models, SIMULATED: SHIPPED / SIMULATED}
+    inputs |= {f"models/{name}": identity(path) for name, path in judged.items()}
+    reason = stale(folder, "evaluation", inputs)
     if reason is None:
         return table.read_text()
-    if done.exists():
+    if metrics.exists():
         say(f"evaluate: again, because {reason}")
     predicted = predictions(models, data)
-    simulated = transfer.predictions(config, data, workdir)
-    if simulated is not None:
-        predicted[transfer.TITLE] = simulated
-    summary = evaluation.image_summary(
-        {**evaluation.image_baselines(data.train, data.validation), **predicted}, data.validation
-    )
+    simulated_training = transferred(config, data, workdir)
+    if simulated_training is not None:
+        predicted[SIMULATED_TITLE] = simulated_training
+    baselines = evaluation.image_baselines(data.train, data.validation)
+    summary = evaluation.image_summary({**baselines, **predicted}, data.validation)
     logs = {TITLES[name]: records.read(path / records.NAME) for name, path in models.items()}
     figures = [folder / "figures" / name for name in ("predictions.png", "training.png")]
     draw(config, data, predicted, figures[0])
     evaluation.figures.training_curves(figures[1], logs)
     text = as_table(config, data, summary, logs)
     storage.write_bytes(table, text.encode())
-    results.write(done, {"source": data.source, **summary}, inputs, [table, *figures])
+    storage.write_json(metrics, {"source": data.source, **summary})
+    record(folder, "evaluation", inputs, [metrics, table, *figures])
     return text
 
 
 def predictions(models: Mapping[str, Path], data: Recorded) -> dict[str, Predicted]:
-    """Predict the validation trajectories with each model, from each subset of its inputs.
-
-    Returns:
-        The predictions. The keys are the titles of the rows in the table.
-    """
-    found = {}
-    first = {stream: getattr(data.validation, stream)[:, 0].astype(np.float32) / 255 for stream in evaluation.STREAMS}
+    """Predict the validation trajectories with each model, from each subset of its inputs, by title of the row."""
+    rows = {}
+    first = _unit({stream: getattr(data.validation, stream)[:, 0] for stream in evaluation.STREAMS})
     for name, path in models.items():
         predictor = sts.Predictor.load(path)
         for given, subset in evaluation.subsets(predictor.modalities).items():
             out = predictor(**{stream: first[stream] for stream in subset})
             title = TITLES[name] if len(subset) == len(predictor.modalities) else f"{TITLES[name]}, {given} alone"
-            visual, tactile = (None if image is None else np.asarray(image) for image in (out.visual, out.tactile))
-            found[title] = Predicted(visual, tactile)
-    return found
+            rows[title] = Predicted(*(None if x is None else np.asarray(x) for x in (out.visual, out.tactile)))
+    return rows
+
+
+def transferred(config: Config, data: Recorded, workdir: Path) -> Predicted | None:
+    """Predict the validation trajectories with the library's model `released`, which knows simulated images only.
+
+    The brightness and the colours of the images are adapted to the model's training images, and those of the
+    predictions back to the recorded images (`hardware.relit`).
+
+    Returns:
+        The predictions at `config.image_size`, or None if the model does not support this size.
+    """
+    predictor = sts.Predictor.load(SIMULATED)
+    side, (height, _) = config.image_size, predictor.preprocessing.resolution
+    if height % side:
+        return None
+    large = read(dataclasses.replace(config, image_size=height), workdir)
+    recorded, model = SensorView(**_unit(large.empty)), SensorView(**predictor.empty)
+    streams = _unit({"visual": large.validation.visual[:, 0], "tactile": large.validation.tactile[:, 0]})
+    views = [hardware.relit(SensorView(*pair), recorded, model) for pair in zip(*streams.values(), strict=True)]
+    out = predictor(
+        visual=np.stack([view.visual for view in views]), tactile=np.stack([view.tactile for view in views])
+    )
+    visual, tactile = np.asarray(out.visual), np.asarray(out.tactile)
+    if visual.shape[1:3] != (side, side):
+        return None
+    recorded, model = SensorView(**_unit(data.empty)), SensorView(*(_reduced(image, side) for image in model))
+    back = [hardware.relit(SensorView(*pair), model, recorded) for pair in zip(visual, tactile, strict=True)]
+    return Predicted(np.stack([view.visual for view in back]), np.stack([view.tactile for view in back]))
+
+
+def _unit(images: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Convert uint8 images to float32 in [0, 1]."""
+    return {stream: image.astype(np.float32) / 255 for stream, image in images.items()}
+
+
+def _reduced(image: np.ndarray, side: int) -> np.ndarray:
+    """Reduce a square image to `side` pixels by averaging blocks of pixels."""
+    step = image.shape[0] // side
+    return image.reshape(side, step, side, step, 3).mean((1, 3))
 
 
 def draw(config: Config, data: Recorded, predicted: Mapping[str, Predicted], path: Path) -> None:
     """Draw input images of the first validation trajectories, and predicted and true images of the object at rest."""
     held = data.validation
     labels = [f"#{number}" for number in held.number[: config.num_shown]]
+    columns = {"MVAE": TITLES["mvae-without-pose"], "simulated training": SIMULATED_TITLE}
 
     def truth(stream: str, moment: int) -> np.ndarray:
         return getattr(held, stream)[: len(labels), moment] / 255
 
-    def guess(name: str, stream: str) -> np.ndarray:
-        return getattr(predicted[TITLES[name]], stream)[: len(labels)]
-
-    def simulated(stream: str) -> dict[str, np.ndarray]:
-        own = predicted.get(transfer.TITLE)
-        return {} if own is None else {"simulated training": getattr(own, stream)[: len(labels)]}
-
-    groups = [
-        {"visual": truth("visual", 0), "tactile": truth("tactile", 0)},
-        {
-            "VAE visual only": guess("vae-visual", "visual"),
-            "MVAE": guess(MVAE, "visual"),
-            **simulated("visual"),
-            "truth": truth("visual", 1),
-        },
-        {
-            "VAE tactile only": guess("vae-tactile", "tactile"),
-            "MVAE": guess(MVAE, "tactile"),
-            **simulated("tactile"),
-            "truth": truth("tactile", 1),
-        },
-    ]
+    groups = [{"visual": truth("visual", 0), "tactile": truth("tactile", 0)}]
+    for stream in ("visual", "tactile"):
+        rows = {f"VAE {stream} only": TITLES[f"vae-{stream}"], **columns}
+        group = {
+            head: getattr(predicted[title], stream)[: len(labels)] for head, title in rows.items() if title in predicted
+        }
+        groups.append({**group, "truth": truth(stream, 1)})
     evaluation.figures.comparison(
         path,
         groups,
@@ -119,32 +332,25 @@ def draw(config: Config, data: Recorded, predicted: Mapping[str, Predicted], pat
 
 
 def as_table(config: Config, data: Recorded, summary: dict, logs: Mapping[str, list[dict]]) -> str:
-    """Write the table of the models' scores (Table 2 of the paper) as text in Markdown.
-
-    Args:
-        config: Configuration of the experiment.
-        data: Recorded trajectories.
-        summary: Scores with 95 % intervals, from `evaluation.image_summary`.
-        logs: Training logs by the title of the model.
-    """
-    names = [FLOOR, *dict.fromkeys(name for own in summary.values() for name in own["predictors"])]
+    """Write the scores with their 95 % intervals (`evaluation.image_summary`) as a table in Markdown."""
+    names = [FLOOR, *dict.fromkeys(name for scores in summary.values() for name in scores["predictors"])]
     heads = ["predictor"]
     for stream in summary:
         heads += [f"{stream} BCE (x1e-4)", f"{stream} skill", f"{stream} skill against the copy"]
     lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     for name in names:
         cells = []
-        for own in summary.values():
-            found = own["predictors"].get(name)
+        for scores in summary.values():
+            row = scores["predictors"].get(name)
             if name == FLOOR:
-                cells += [f"{1e4 * own['floor']:.0f}", "1", "1"]
-            elif found is None:
+                cells += [f"{1e4 * scores['floor']:.0f}", "1", "1"]
+            elif row is None:
                 cells += ["NA", "NA", "NA"]
             else:
-                bce = {key: 1e4 * value for key, value in found["bce"].items()}
+                bce = {key: 1e4 * value for key, value in row["bce"].items()}
                 cells.append(f"{bce['value']:.0f} [{bce['low']:.0f}, {bce['high']:.0f}]")
                 cells += [
-                    f"{found[key]['value']:.3f} [{found[key]['low']:.3f}, {found[key]['high']:.3f}]"
+                    f"{row[key]['value']:.3f} [{row[key]['low']:.3f}, {row[key]['high']:.3f}]"
                     for key in ("skill", "skill_copy")
                 ]
         lines.append(f"| {' | '.join([name, *cells])} |")
@@ -164,7 +370,7 @@ def as_table(config: Config, data: Recorded, summary: dict, logs: Mapping[str, l
             "",
             f"Gradient steps: {steps}, batch {config.training.batch_size}.",
             "",
-            f"{transfer.TITLE}: the library's model `{transfer.NAME}` from both held images. It has seen no image of "
+            f"{SIMULATED_TITLE}: the library's model `{SIMULATED}` from both held images. It has seen no image of "
             "this sensor, and its training objects are other cameras.",
             "",
         ]

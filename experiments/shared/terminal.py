@@ -1,32 +1,110 @@
-"""The terminal of `experiments.real collect --headless`: prints the instructions, and reads keys."""
+"""What a command says: progress, errors and warnings on one line, and the instructions and keys of a collection."""
 
 import contextlib
 import os
 import select
+import signal
 import sys
+import time
+import warnings
 from collections.abc import Iterator
+from typing import Any
 
-from experiments.shared.progress import say
+from tqdm import tqdm
+
+from sts_jax import hardware
 from sts_jax.hardware import Action, Stage, View
+from sts_jax.storage import LockedError
 
+# Errors that the library raises for mistakes that the user can correct
+CORRECTABLE = (
+    OSError,
+    ValueError,
+    ImportError,
+    FloatingPointError,
+    LockedError,
+    hardware.CameraError,
+    hardware.LightError,
+    hardware.NoContrastError,
+)
 KEYS = {"\n": Action.CONFIRM, "\r": Action.CONFIRM, "d": Action.DISCARD, "q": Action.STOP}
+_EVERY_S = 10.0  # time between two lines of progress where standard error is not a terminal (s)
+
+
+def say(text: str) -> None:
+    """Print one line for the user, on standard error."""
+    print(text, file=sys.stderr, flush=True)
+
+
+class Bar:
+    """A progress bar on a terminal, and a line about every ten seconds elsewhere."""
+
+    def __init__(self) -> None:
+        self._bar: tqdm | None = None
+        self._stage = ""
+        self._said_s = 0.0
+
+    def __enter__(self) -> "Bar":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
+    def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
+        """Show that `done` of `total` items of a stage are finished. A new stage starts a new bar."""
+        if sys.stderr.isatty():
+            if stage != self._stage or self._bar is None:
+                if self._bar is not None:
+                    self._bar.close()
+                self._bar = tqdm(total=total, desc=stage, initial=done, dynamic_ncols=True)
+            self._bar.set_postfix_str(note, refresh=False)
+            self._bar.update(done - self._bar.n)
+        elif stage != self._stage or done == total or time.monotonic() - self._said_s > _EVERY_S:
+            say(f"{stage}: {done}/{total} {note}".rstrip())
+            self._said_s = time.monotonic()
+        self._stage = stage
+
+
+@contextlib.contextmanager
+def on_one_line(*, debug: bool = False) -> Iterator[None]:
+    """End the program with the line `error: ...` after an error that the user can correct. Warnings take one line too.
+
+    Args:
+        debug: Leave errors as they are, with their tracebacks.
+    """
+    usual, warnings.formatwarning = warnings.formatwarning, _note
+    try:
+        yield
+    except CORRECTABLE as error:
+        if debug:
+            raise
+        raise SystemExit(f"error: {error}") from None
+    finally:
+        warnings.formatwarning = usual
+
+
+def _note(message: Warning | str, *_: Any, **__: Any) -> str:
+    return f"note: {message}\n"
+
+
+def interrupt_on_sigterm() -> None:
+    """Make SIGTERM raise a `KeyboardInterrupt`, so that the process writes its files and ends as after Ctrl+C."""
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGTERM, interrupt)
 
 
 class Terminal:
-    """Implements `hardware.Person` with a terminal: prints the instructions, and reads the person's actions.
+    """A `hardware.Person` at a terminal: Enter confirms, d discards the trajectory, q stops.
 
-    The key Enter confirms the current stage of the recording, d discards the current trajectory, and q ends the
-    collection. If the standard input is not a terminal, each line acts like a key, and an empty line acts like Enter.
-    The end of the input has the same effect as q.
+    If the standard input is not a terminal, each line acts like a key, an empty line like Enter, and its end like q.
     """
 
     def __init__(self, count: int | None = None, *, keys: bool = True):
-        """Print a line that explains the keys.
-
-        Args:
-            count: Number of trajectories that is shown as the goal. None: no goal.
-            keys: False if no keys are read, so that the line is not printed.
-        """
+        """Explain the keys, unless `keys` is False. `count` is the number of trajectories to reach, if there is one."""
         self._goal = "" if count is None else f" of {count}"
         self._shown: object = None
         self._stages: tuple[Stage | None, Stage | None] = (None, None)  # stages of the last two views
@@ -34,11 +112,7 @@ class Terminal:
             say("Enter confirms, d discards, q stops")
 
     def show(self, view: View) -> None:
-        """Print `view.problem`, or `view.instruction` if there is no problem.
-
-        Nothing is printed if the instruction, the problem and the number of the trajectory are the same as in the
-        previous call.
-        """
+        """Print the problem or the instruction of a view, unless it was printed last."""
         self._stages = self._stages[1], view.stage
         shown = view.instruction, view.problem, view.number
         if shown != self._shown:
@@ -47,39 +121,28 @@ class Terminal:
             say(f"[{view.confirmed}{self._goal}]{number} {view.problem or view.instruction}")
 
     def action(self) -> Action | None:
-        """Return the action of the next key that was pressed, or None if there is none.
+        """The action of the next key that was pressed, or None.
 
-        The method does not wait for a key. Unknown keys are ignored. Enter and d are also ignored if they were pressed
-        before the person saw the current stage of the recording (`hardware.Stage`).
+        Enter and d are ignored if they were pressed before the person saw the current stage.
         """
         while select.select([sys.stdin], [], [], 0)[0]:
             data = os.read(sys.stdin.fileno(), 1)
             if not data:
                 say("the standard input has ended")
                 return Action.STOP
-            key = data.decode(errors="replace")
             if not sys.stdin.isatty():
-                key = self._line(data).decode(errors="replace").strip() or "\n"
-            if (action := KEYS.get(key.lower())) is not None and (
-                action is Action.STOP or self._stages[0] is self._stages[1]
-            ):
+                while not data.endswith(b"\n") and (more := os.read(sys.stdin.fileno(), 1)):
+                    data += more
+                data = data.strip() or b"\n"
+            action = KEYS.get(data.decode(errors="replace").lower())
+            if action is not None and (action is Action.STOP or self._stages[0] is self._stages[1]):
                 return action
         return None
-
-    def _line(self, line: bytes) -> bytes:
-        """Read the rest of a line whose first byte was read already."""
-        while not line.endswith(b"\n") and (more := os.read(sys.stdin.fileno(), 1)):
-            line += more
-        return line
 
 
 @contextlib.contextmanager
 def single_keys() -> Iterator[None]:
-    """Let the program read each key immediately, without waiting for Enter, as long as the `with` block runs.
-
-    Raises:
-        ValueError: The terminals of this system cannot be read key by key.
-    """
+    """Let the program read each key at once, without waiting for Enter."""
     if not sys.stdin.isatty():
         yield
         return

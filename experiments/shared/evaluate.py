@@ -1,0 +1,333 @@
+"""Evaluates every model of an experiment with every subset of its inputs, and records what the results belong to."""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+import sts_jax as sts
+from experiments.shared import drawing
+from experiments.shared.config import MODELS, NONE, TITLES, Extensions, Run
+from experiments.shared.terminal import Bar, say
+from sts_jax import dataset, evaluation, storage, training
+from sts_jax.dataset.measurement import NAMES
+from sts_jax.training import records
+
+# The main table has rows for the main model with the first five of these inputs that the model supports.
+MAIN_SUBSETS = (
+    *("visual", "tactile", "visual and tactile", "visual and pose", "all inputs", "pose"),
+    evaluation.TRUE_STATE,
+)
+SEED = 20  # seed of the re-rolls
+
+Judge = Callable[[evaluation.Predicted, dataset.Pairs], evaluation.Scores]
+
+
+def stale(folder: Path, part: str, inputs: Mapping[str, str]) -> str | None:
+    """Why a part of the results of a folder must be computed again, or None if it is up to date.
+
+    Args:
+        folder: Folder of the results, with the manifest that `record` writes.
+        part: Name of the part, such as "evaluation".
+        inputs: Current checksum of each input, by name.
+    """
+    try:
+        manifest = storage.read_manifest(folder, "it will be written again")
+        if manifest is None or part not in manifest.facts:
+            return f"{storage.MANIFEST} has no record of the {part}"
+        recorded = manifest.facts[part]
+        for name in {**recorded["inputs"], **inputs}:
+            if recorded["inputs"].get(name) != inputs.get(name):
+                return f"{name} has changed since"
+        storage.verify(folder, manifest, "it will be written again", recorded["files"])
+    except storage.DamagedFileError as error:
+        return str(error)
+    return None
+
+
+def record(folder: Path, part: str, inputs: Mapping[str, str], files: Sequence[Path]) -> None:
+    """Add the inputs and the files of a part of the results to the manifest of a folder, after all files are written.
+
+    Args:
+        folder: Folder of the results.
+        part: Name of the part.
+        inputs: Checksum of each input, by name.
+        files: Files of the part, in the folder or below it.
+    """
+    try:
+        before = storage.read_manifest(folder, "")
+    except storage.DamagedFileError:
+        before = None
+    sums, facts = ({}, {}) if before is None else (before.files, before.facts)
+    names = [file.relative_to(folder).as_posix() for file in files]
+    others = {name: sums[name] for other in facts if other != part for name in facts[other]["files"]}
+    facts = {**facts, part: {"inputs": dict(inputs), "files": names}}
+    storage.write_manifest(folder, {**others, **storage.checksums(folder, names)}, facts)
+
+
+def identity(model: Path) -> str:
+    """SHA-256 that changes with every file of a model: its manifest has their checksums, and its log is short."""
+    names = ("manifest.json", "calibration.json", records.NAME)
+    return storage.digest({name: storage.sha256(model / name) for name in names if (model / name).exists()})
+
+
+class SplitPairs(NamedTuple):
+    """The first and last frames of the parts of a split.
+
+    The images of `validation` and `given` have the resolution of the models' inputs. The images of `train` and `test`
+    have the resolution `config.image_size`, in which predictions are scored.
+    """
+
+    train: dataset.Pairs  # training trajectories
+    validation: dataset.Pairs  # validation trajectories
+    given: dataset.Pairs  # held-out trajectories, as inputs
+    test: dataset.Pairs  # the same held-out trajectories, as targets
+
+
+def evaluate(run: Run, data: dataset.Dataset, own: Extensions = NONE) -> str:
+    """Score every model on held-out trajectories, write the results, and return the main table in Markdown.
+
+    The results are `metrics.json`, `table.md`, `table-full.md` and `figures/`. `manifest.json` records the checksums of
+    their inputs and of themselves. While all of them match, nothing is evaluated again.
+
+    Args:
+        run: The split of the experiment, with trained models.
+        data: Dataset of the experiment.
+        own: Your own metrics, columns and modalities.
+    """
+    config, workdir, scenario = run.config, run.workdir, run.config.collection.scenario
+    part, inputs = f"evaluation by {run.split}", _inputs(run, data, own)
+    metrics, table, complete = (
+        workdir / name for name in (f"metrics{run.suffix}.json", f"table{run.suffix}.md", f"table-full{run.suffix}.md")
+    )
+    reason = stale(workdir, part, inputs)
+    if reason is None:
+        return table.read_text()
+    if metrics.exists() or table.exists():
+        say(f"evaluate: again, because {reason}")
+    _check_measurements(run.folder(run.main_model), own)
+    pairs = _pairs(run, data, own)
+    test, judge = pairs.test, evaluation.scorer(scenario, pairs.train, metrics=own.scored)
+    rerolls = ceilings(run, data, test, judge, own.metrics)  # re-rolls have no further modalities
+    references = evaluation.baselines(scenario, pairs.train, test)
+    scores = {**rerolls.scores, **{title: judge(row, test) for title, row in references.items()}}
+    with Bar() as bar:
+        predicted, shown = _scored(run, pairs, judge, bar)
+        scores |= predicted
+        summary = evaluation.summarise(scores, test, metrics=own.scored, outcomes=scenario.outcomes)
+        bar("evaluate", len(predicted), len(predicted), "intervals done")
+
+    logs = {TITLES[name]: records.read(run.folder(name) / records.NAME) for name in MODELS[config.model]}
+    figures = drawing.draw(run, test, scores, shown, rerolls.pose)
+    figures.append(run.figures / "training.png")
+    evaluation.figures.training_curves(figures[-1], logs)
+    if not run.suffix and len(data.full_trajectories()):
+        figures.append(run.figures / "strip.png")
+        drawing.draw_strip(figures[-1], config.collection, run.sensor, data)
+
+    model = TITLES[run.main_model]
+    title = f"{workdir.name}: the last frame predicted from the first, held out by {run.split}"
+    notes = [*_notes(run, logs), *_gains(model, scores, test)]
+    text = evaluation.table(summary, title=title, rows=main_rows(model, list(shown)), notes=notes, columns=own.columns)
+    full = evaluation.full_table(summary, title=title, notes=notes, metrics=own.scored)
+    storage.write_bytes(table, text.encode())
+    storage.write_bytes(complete, full.encode())
+    storage.write_json(metrics, {"split": run.split, **summary})
+    record(workdir, part, inputs, [metrics, table, complete, *figures])
+    return text
+
+
+def _inputs(run: Run, data: dataset.Dataset, own: Extensions) -> dict[str, str]:
+    """The checksums of the configuration, the dataset and the models, and of a user's own metrics and columns."""
+    inputs = {"config.json": storage.digest(dataclasses.asdict(run.config)), "dataset": data.identity}
+    for folder in map(run.folder, MODELS[run.config.model]):
+        inputs[folder.relative_to(run.workdir).as_posix()] = identity(folder)
+    if own.described() != NONE.described():
+        inputs["the list of metrics"] = storage.digest(own.described())
+    return inputs
+
+
+def _check_measurements(folder: Path, own: Extensions) -> None:
+    """Raise a `ValueError` unless `own.measurements` has the further modalities of the model in a folder."""
+    trained = sorted(set(sts.Predictor.load(folder).modalities) - set(NAMES))
+    given = sorted(measurement.name for measurement in own.measurements)
+    if given != trained:
+        raise ValueError(
+            f"the names in measurements are {given}, but the model in {folder} was trained with {trained}: pass the "
+            "same Extensions(measurements=...) as for the training, or train the model again in a new work directory"
+        )
+
+
+def _pairs(run: Run, data: dataset.Dataset, own: Extensions) -> SplitPairs:
+    rows, size, further = evaluation.rows_of(data, run.split), run.config.image_size, own.measurements
+    train = dataset.reduced(data.pairs(rows["train"], symmetries=True, measurements=further), size)
+    validation, given = (data.pairs(rows[part], measurements=further) for part in ("validation", "test"))
+    test = dataset.reduced(given, size)
+    if run.config.model == "paper":
+        validation, given = dataset.reduced(validation, size), test
+    return SplitPairs(train, validation, given, test)
+
+
+def queries(run: Run) -> Iterator[tuple[str, sts.Predictor, tuple[str, ...]]]:
+    """Each model with each scored subset of its inputs: the title of the table's row, the model, and the inputs."""
+    for name in MODELS[run.config.model]:
+        predictor = sts.Predictor.load(run.folder(name))
+        subsets = evaluation.subsets(predictor.modalities, state=run.config.model == "statespace")
+        for given, subset in subsets.items():
+            yield f"{TITLES[name]}, {given}", predictor, subset
+
+
+def _scored(
+    run: Run, pairs: SplitPairs, judge: Judge, bar: Bar
+) -> tuple[dict[str, evaluation.Scores], dict[str, evaluation.Predicted]]:
+    """The scores of all queries, and their first predictions for the figures, by title."""
+    config = run.config
+    blank = training.load_blank(run.folder(run.main_model))[0] / 255
+    scores, shown = {}, {}
+    jobs = list(queries(run))
+    for number, (title, predictor, subset) in enumerate(jobs):
+        bar("evaluate", number, len(jobs), title)
+        row = evaluation.predict(
+            predictor,
+            subset,
+            pairs.given,
+            config.collection.scenario,
+            validation=pairs.validation,
+            blank=blank,
+            num_samples=config.num_samples if config.model == "statespace" else 0,
+        )
+        scores[title] = judge(row, pairs.test)
+        shown[title] = evaluation.first(row, config.num_shown)
+    return scores, shown
+
+
+def main_rows(model: str, titles: Sequence[str]) -> list[str]:
+    """Titles of the main table's rows: the ceiling, the baselines, and up to five rows of the main model.
+
+    Args:
+        model: Title of the main model.
+        titles: Titles of the rows of all models.
+    """
+    wanted = [f"{model}, from {given}" for given in MAIN_SUBSETS]
+    return [evaluation.CEILING, *evaluation.BASELINES, *[title for title in wanted if title in titles][:5]]
+
+
+def _notes(run: Run, logs: Mapping[str, Sequence[Mapping[str, float]]]) -> list[str]:
+    """The notes below a table: the schedule of the training, and an explanation of the ceiling."""
+    steps = ", ".join(f"{name} {log[-1]['step'] if log else 0}" for name, log in logs.items())
+    return [
+        f"Gradient steps: {steps}, batch {run.config.schedule.batch_size}.",
+        f"Ceiling: {run.config.rerolls} re-rolls of the hidden values of each start. Touch can reveal a part of these "
+        "values, and a model from touch can exceed it.",
+    ]
+
+
+def _gains(model: str, scores: Mapping[str, evaluation.Scores], test: dataset.Pairs) -> list[str]:
+    """A note on the share by which touch lowers the log loss of the outcome, if the main model predicts outcomes."""
+    before, after = (scores.get(f"{model}, from {given}") for given in ("visual", "visual and tactile"))
+    gain = None if before is None or after is None else evaluation.gain(before, after, test)
+    if gain is None:
+        return []
+    return [
+        f"Touch removes {gain['value']:.3f} [{gain['low']:.3f}, {gain['high']:.3f}] of the outcome's log loss from "
+        "vision."
+    ]
+
+
+class Ceilings(NamedTuple):
+    """Re-rolls of held-out trajectories, and the scores of predictions made from them."""
+
+    scores: dict[str, evaluation.Scores]  # scores of the mean of the re-rolls, and of a single re-roll
+    pose: np.ndarray  # poses at rest, shape (times, n, 7)
+    outcome: np.ndarray  # numbers of the outcomes, int of shape (times, n)
+
+
+def ceilings(
+    run: Run, data: dataset.Dataset, test: dataset.Pairs, judge: Judge, metrics: Sequence[evaluation.Metric]
+) -> Ceilings:
+    """Read the re-rolls of the first held-out trajectories from `ceiling.npz`, or simulate them and write this file.
+
+    Args:
+        run: The split of the experiment.
+        data: Dataset of the experiment.
+        test: Held-out trajectories, as targets.
+        judge: Function that scores a prediction (`evaluation.scorer`).
+        metrics: Metrics that `judge` computes. Their source code is not compared.
+    """
+    config, workdir = run.config, run.workdir
+    part, path = f"ceiling by {run.split}", workdir / f"ceiling{run.suffix}.npz"
+    few = test.take(slice(config.num_rerolled))
+    inputs = {
+        "dataset": data.identity,
+        "the held-out list": storage.digest(few.trajectory.tolist()),
+        "the re-rolls": storage.digest([config.rerolls, SEED]),
+        "the list of metrics": storage.digest(sorted(metric.name for metric in metrics)),
+    }
+    reason = stale(workdir, part, inputs)
+    if reason is not None:
+        if path.exists():
+            say(f"ceilings: again, because {reason}")
+        with Bar() as bar:
+            total = config.rerolls * len(few.object)
+            made = reroll(run, few, config.rerolls, judge, lambda done: bar("re-roll", done, total))
+        storage.write_arrays(path, _flat(made))
+        record(workdir, part, inputs, [path])
+    return _restored(storage.read_arrays(path, f"delete {path.name}, and evaluate again"))
+
+
+def reroll(
+    run: Run,
+    test: dataset.Pairs,
+    times: int,
+    judge: Judge,
+    progress: Callable[[int], object] | None = None,
+) -> Ceilings:
+    """Re-roll trajectories, and score two predictions of each: the mean of its re-rolls, and one of its re-rolls.
+
+    Args:
+        run: The split of the experiment.
+        test: Trajectories to re-roll.
+        times: Number of re-rolls of each trajectory.
+        judge: Function that scores a prediction of the trajectories in `test`.
+        progress: Function that receives the total number of re-rolls that have been simulated so far.
+    """
+    mean = evaluation.ceiling(run.config.collection, run.sensor, test, times, jax.random.key(SEED), progress=progress)
+    samples = mean.samples
+    assert samples is not None
+    assert samples.pose is not None
+    assert samples.outcome is not None
+    one = evaluation.Predicted(*(None if leaf is None else leaf[0] for leaf in samples[:4]))
+    scores = {evaluation.CEILING: judge(mean, test), evaluation.ONE_REROLL: judge(one, test)}
+    return Ceilings(scores, samples.pose, samples.outcome)
+
+
+def _flat(made: Ceilings) -> dict[str, np.ndarray]:
+    """All arrays by a path such as `one re-roll/visual/bce` or `one re-roll/further/height_error`, for a file."""
+    arrays = {"pose": made.pose, "outcome": made.outcome}
+    for name, scores in made.scores.items():
+        for field, value in scores._asdict().items():
+            if isinstance(value, evaluation.metrics.ImageError):
+                arrays |= {f"{name}/{field}/{part}": leaf for part, leaf in value._asdict().items()}
+            elif isinstance(value, dict):
+                arrays |= {f"{name}/{field}/{part}": leaf for part, leaf in value.items()}
+            elif isinstance(value, np.ndarray):
+                arrays[f"{name}/{field}"] = value
+    return arrays
+
+
+def _restored(arrays: dict[str, np.ndarray]) -> Ceilings:
+    """The inverse of `_flat`."""
+    scores = {}
+    for name in evaluation.CEILINGS:
+        own = {key.removeprefix(f"{name}/"): leaf for key, leaf in arrays.items() if key.startswith(f"{name}/")}
+        fields: dict = dict.fromkeys(evaluation.Scores._fields) | {
+            key: leaf for key, leaf in own.items() if "/" not in key
+        }
+        for field in {key.partition("/")[0] for key in own if "/" in key}:
+            parts = {key.partition("/")[2]: leaf for key, leaf in own.items() if key.startswith(f"{field}/")}
+            fields[field] = parts if field == "further" else evaluation.metrics.ImageError(**parts)
+        scores[name] = evaluation.Scores(**fields)
+    return Ceilings(scores, arrays["pose"], arrays["outcome"])
