@@ -29,6 +29,7 @@ from tqdm import tqdm
 import sts_jax as sts
 from benchmarks.instruments.experiments import EXPERIMENTS
 from experiments.shared import evaluate, run
+from experiments.shared.config import Run
 from sts_jax import dataset, evaluation, storage
 
 
@@ -92,10 +93,9 @@ def main(args: Args) -> None:
         pairs = data.pairs(rows["train"]), data.pairs(rows["test"][: config.num_rerolled])
     train, test = (dataset.reduced(part, config.image_size) for part in pairs)
     judge = evaluation.scorer(config.collection.scenario, train)
+    split = Run(config, folder, sensor, config.splits[0])
     with tqdm(total=args.times * len(test.object), desc="re-roll", unit="trajectories") as bar:
-        made = evaluate.reroll(
-            config.collection, sensor, test, args.times, judge, lambda done: bar.update(done - bar.n)
-        )
+        made = evaluate.reroll(split, test, args.times, judge, lambda done: bar.update(done - bar.n))
     scores = dict(made.scores)
     for title, row in evaluation.baselines(config.collection.scenario, train, test).items():
         scores[title] = judge(row, test)

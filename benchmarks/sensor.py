@@ -51,7 +51,7 @@ import sts_jax as sts
 from benchmarks.instruments import fresh
 from benchmarks.instruments.meshes import public_meshes
 from benchmarks.instruments.timing import in_turn
-from experiments.shared import drawing
+from experiments.shared.drawing import write_figure
 from sts_jax import geometry, objects, optics, tactile
 from sts_jax.rendering import drawing, equilibrium
 
@@ -432,7 +432,7 @@ def cost() -> None:
         )
     right.set(xlabel="faces", ylabel="ms a frame", title="a bottle at rest")
     right.legend()
-    drawing.write_figure(RESULTS / "cost.png", figure, dpi=110)
+    write_figure(RESULTS / "cost.png", figure, dpi=110)
 
 
 def compilations(number: int = 100) -> None:

@@ -3,7 +3,6 @@
     python -m experiments.real                    # about 15 minutes, collects 100 trajectories of the twin if needed
     python -m experiments.real --preset paper     # the paper's training schedule, 500 trajectories at 1640x1232
     python -m experiments.real --preset smoke     # a short run of every stage, for tests
-    python -m experiments.real --plan             # prints the expected seconds of each stage
 
     python -m experiments.real collect --sensor bench --count 500   # shows a page in the browser
     python -m experiments.real collect --camera /dev/v4l/by-id/... --leds /dev/ttyACM0    # without a sensor file
@@ -14,8 +13,7 @@
 
 The default sub-command is `train`. This sub-command trains three models on the trajectories in `WORKDIR/dataset`. The
 models are called "VAE visual only", "VAE tactile only" and "MVAE without pose". The models learn to predict the images
-of the object at rest from the images of the held object. Results go to `WORKDIR/table2`. With `--preset paper`, the
-sub-command first prints the expected seconds of each stage, unless there are results already. A work directory cannot
+of the object at rest from the images of the held object. Results go to `WORKDIR/table2`. A work directory cannot
 contain trajectories of both a device and the twin, so give the twin a separate `--workdir`.
 
 `--sensor` is the sensor file of `experiments.commission`. The sensor file contains the lens, and names the images of
@@ -36,12 +34,11 @@ from typing import Annotated
 import tyro
 
 import sts_jax as sts
-from experiments.shared import terminal
+from experiments.shared import table2, terminal
 from experiments.shared.collecting import Collect, collect
-from experiments.shared.recorded import Config
 from experiments.shared.reviewing import Review, review
 from experiments.shared.run import chosen_preset
-from experiments.shared.table2_command import Train, learn
+from experiments.shared.table2 import Config, Train
 from sts_jax.training import TrainConfig
 
 DEFAULT = Config(
@@ -79,7 +76,7 @@ def main(config: Train | Collect | Review) -> None:
         try:
             match config:
                 case Train():
-                    learn(config)
+                    table2.main(config)
                 case Collect():
                     collect(config)
                 case Review():

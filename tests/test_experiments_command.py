@@ -1,7 +1,6 @@
-"""Presets, and the effect of the options of the command line on them. No experiment is run."""
+"""Presets, the effect of options on them, checks before any work, and the record of results. No experiment is run."""
 
 import dataclasses
-import json
 import re
 import warnings
 from pathlib import Path
@@ -14,13 +13,19 @@ from experiments import freefall, inclined, perturbed, released
 from experiments.shared import config, drawing, evaluate, run, terminal
 from sts_jax import compilation, dataset, physics, storage, training
 
-BOTTLES = ("bottle",)
+EXPERIMENTS = {"freefall": freefall, "inclined": inclined, "perturbed": perturbed, "released": released}
+PRESETS = {f"{name}-{key}": one for name, experiment in EXPERIMENTS.items() for key, one in experiment.PRESETS.items()}
+
+
+def changed(preset=freefall.SMOKE, collection=None, **fields):
+    return dataclasses.replace(
+        preset, collection=dataclasses.replace(preset.collection, **(collection or {})), **fields
+    )
 
 
 def smoke_of_few(experiment):
     """The preset `smoke` of an experiment, with shares for which four objects are enough."""
-    collection = dataclasses.replace(experiment.SMOKE.collection, shares=(0.5, 0.25, 0.25))
-    return dataclasses.replace(experiment.SMOKE, collection=collection)
+    return changed(experiment.SMOKE, {"shares": (0.5, 0.25, 0.25)})
 
 
 @pytest.fixture
@@ -36,12 +41,17 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "meshes"
 
 
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_can_be_run(name):
+    config.check(PRESETS[name])
+
+
 @pytest.mark.parametrize(
     ("experiment", "classes", "trajectories"),
     [
         (freefall, sts.objects.CATEGORIES, 1700),
         (inclined, sts.objects.CATEGORIES, 2400),
-        (perturbed, BOTTLES, 2500),
+        (perturbed, ("bottle",), 2500),
         (released, ("camera",), 500),
     ],
 )
@@ -58,63 +68,48 @@ def test_presets_hold_out_enough_objects_and_that_of_the_paper_has_its_counts(ex
     assert (schedule.epochs, schedule.batch_size, schedule.beta_warmup) == (200, 64, 50 / 200)
     assert (experiment.PAPER.targets, experiment.PAPER.splits) == ("own", ("trajectory", "object"))
     assert not experiment.PAPER.mask_blank_touch
-    model = training.paper_model(config.MODELS["paper"]["mvae"], run.preprocessing_of(experiment.PAPER))
+    model = training.paper_model(config.MODELS["paper"]["mvae"], experiment.PAPER.preprocessing)
     assert [m.weight for m in model.modalities] == [1, 1, 1000]
     assert [m.shape for m in model.modalities] == [(64, 64, 3), (64, 64, 3), (7,)]
 
 
-def test_options_reach_the_experiment(tmp_path, monkeypatch, capsys):
+def test_options_reach_the_experiment(tmp_path, monkeypatch):
     ran = []
-    monkeypatch.setattr(stages, "main", lambda config, workdir, only: ran.append((config, workdir)))
-    monkeypatch.setattr(command, "plan", lambda config: f"plan of {config.collection.num_objects} objects")
+    monkeypatch.setattr(run, "main", lambda config, workdir, only: ran.append((config, workdir, only)))
     monkeypatch.setattr("sys.argv", ["freefall", "--hidden", "off", "--classes", "fork", "bottle", "--parts"])
-    run.run(freefall.PRESETS, str(tmp_path), "What it does.")
-    monkeypatch.setattr("sys.argv", ["freefall", "--preset", "smoke", "--workdir", str(tmp_path / "other")])
-    run.run(freefall.PRESETS, str(tmp_path), None)
-    collection = dataclasses.replace(
-        freefall.DEFAULT.collection,
-        scenario=physics.variant(physics.Freefall(), "off"),
-        categories=("fork", "bottle"),
-        parts=True,
-    )
-    asked = dataclasses.replace(freefall.DEFAULT, collection=collection)
-    assert ran == [(asked, tmp_path), (freefall.SMOKE, tmp_path / "other")]
-    monkeypatch.setattr("sys.argv", ["freefall", "--plan"])
-    run.run(freefall.PRESETS, str(tmp_path), None)
-    assert capsys.readouterr().out == "plan of 2000 objects\n"
-    assert len(ran) == 2
+    run.command(freefall.PRESETS, str(tmp_path), "What it does.")
+    other = ["--preset", "smoke", "--workdir", str(tmp_path / "other"), "--only", "train"]
+    monkeypatch.setattr("sys.argv", ["freefall", *other])
+    run.command(freefall.PRESETS, str(tmp_path), None)
+    scenario = physics.variant(physics.Freefall(), "off")
+    asked = changed(freefall.DEFAULT, {"scenario": scenario, "categories": ("fork", "bottle"), "parts": True})
+    assert ran == [(asked, tmp_path, None), (freefall.SMOKE, tmp_path / "other", "train")]
     assert list(tmp_path.iterdir()) == []
 
 
-def parsed(monkeypatch, *options: str, presets=freefall.PRESETS) -> run.Args:
+def parsed(monkeypatch, *options: str) -> run.Args:
     monkeypatch.setattr("sys.argv", ["experiment", *options])
-    return run.parse(presets, "runs/experiment", None)
+    return run.parse(freefall.PRESETS, "runs/experiment", None)
 
 
 def test_any_field_of_a_preset_can_be_changed(monkeypatch, capsys):
-    options = (
+    args = parsed(
+        monkeypatch,
         *("--collection.num-objects", "1000", "--state-training.learning-rate", "1e-3", "--image-size", "32"),
         *("--collection.scenario.height", "0.07", "--collection.scenario.contact.soft", "0.1"),
         *("--collection.symmetries", "--collection.num-rendered", "None", "--splits", "trajectory", "object"),
         *("--preset", "smoke"),
     )
-    found = parsed(monkeypatch, *options)
-    smoke = freefall.SMOKE
-    contact = dataclasses.replace(smoke.collection.scenario.contact, soft=0.1)
-    expected = dataclasses.replace(
+    smoke, scenario = freefall.SMOKE, freefall.SMOKE.collection.scenario
+    scenario = dataclasses.replace(scenario, height=0.07, contact=dataclasses.replace(scenario.contact, soft=0.1))
+    expected = changed(
         smoke,
-        collection=dataclasses.replace(
-            smoke.collection,
-            num_objects=1000,
-            scenario=dataclasses.replace(smoke.collection.scenario, height=0.07, contact=contact),
-            symmetries=True,
-            num_rendered=None,
-        ),
+        {"num_objects": 1000, "scenario": scenario, "symmetries": True, "num_rendered": None},
         state_training=dataclasses.replace(smoke.state_training, learning_rate=1e-3),
         image_size=32,
         splits=("trajectory", "object"),
     )
-    assert (found.config, found.preset) == (expected, "smoke")
+    assert (args.config, args.preset) == (expected, "smoke")
     assert parsed(monkeypatch).config == freefall.DEFAULT
     assert capsys.readouterr().err == ""
 
@@ -126,19 +121,101 @@ def test_options_of_a_model_that_is_not_trained_are_noted(monkeypatch, capsys):
     assert capsys.readouterr().err == ""
 
 
-@pytest.mark.parametrize("options", [("--preset", "tiny"), ("--only", "draw"), ("--collection.num-object", "x")])
-def test_an_unknown_option_is_refused(options, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--preset", "tiny"), "--preset"),
+        (("--only", "draw"), "--only"),
+        (("--collection.num-object", "x"), "--collection.num-object"),
+        (("--workdir", ""), "name of the folder is empty"),
+        (("--objects", " "), "name of the folder is empty"),
+    ],
+)
+def test_a_wrong_option_is_refused(options, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as stopped:
         parsed(monkeypatch, *options)
     assert stopped.value.code == 2
-    assert options[0] in "".join(capsys.readouterr())
+    assert message in " ".join("".join(capsys.readouterr()).replace("│", " ").split())
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        (
+            {"image_size": 48},
+            r"image_size must be one of 16, 32, 64, 128 for .*'statespace', got 48: give --image-size 32, or",
+        ),
+        ({"image_size": 16, "model": "paper"}, r"image_size must be one of 32, 64, 128 .* model 'paper', got 16"),
+        ({"collection": {"resolution": (96, 128)}}, r"must be square, got 96 x 128: give --collection\.resolution 96"),
+        ({"collection": {"resolution": (8, 8)}}, r"collection\.resolution must be a size .* got 8 x 8: give"),
+        ({"collection": {"crop": True}}, r"collection\.crop is True, .*: give --collection\.no-crop, or --model paper"),
+        ({"model": "paper", "steps": (5,)}, r"steps must have one number for each model \(mvae, .*\), got \(5,\)"),
+        (
+            {"state_training": training.TrainConfig(steps=100, warmup=150, schedule="cosine")},
+            r"state_training\.warmup must be smaller than state_training\.steps \(100\), got 150: give --state-",
+        ),
+        ({"rerolls": 0}, "rerolls must be >= 1, got 0"),
+        ({"splits": ("frame",)}, r"splits must be one or more of object, trajectory, got \('frame',\)"),
+        ({"splits": ()}, r"splits must be one or more of object, trajectory, got \(\)"),
+        ({"collection": {"num_objects": 5}}, r"is 5, so the part 'validation' .* at least 6 objects are needed: raise"),
+        ({"collection": {"shares": (0.8, 0.0, 0.2)}}, r"shares must be > 0 for train, validation, test, got \(0\.8"),
+        ({"collection": {"seed": -1}}, "seed must be"),
+        ({"collection": {"scenario": physics.Freefall(friction=(0.8, 0.4))}}, r"friction is \(0\.8, 0\.4\)"),
+    ],
+)
+def test_a_wrong_field_is_an_error_before_anything_is_written(fields, message, tmp_path):
+    wrong = changed(**fields)
+    with pytest.raises(ValueError, match=message):
+        run.main(wrong, tmp_path / "run")
+    with pytest.raises(ValueError, match=message):
+        run.configure(run.Args(tmp_path / "run", wrong))
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("model", "side", "sizes"),
+    [
+        ("statespace", 128, (16, 32, 64, 128)),
+        ("statespace", 96, (16, 24, 32, 48, 96)),
+        ("paper", 128, (32, 64, 128)),
+        ("paper", 96, (32, 48, 96)),
+    ],
+)
+def test_image_sizes_divide_the_resolution_and_suit_the_networks(model, side, sizes):
+    one = changed(model=model, collection={"resolution": (side, side)}, image_size=sizes[0])
+    assert config.image_sizes(one) == sizes
+    config.check(one)
+
+
+def test_the_smallest_number_of_objects_in_the_message_is_enough():
+    """For each preset, the number in the message is compared with the split of the dataset."""
+    for preset in PRESETS.values():
+
+        def of(count, preset=preset):
+            return changed(preset, {"num_objects": count, "num_full": 0}, splits=("object",))
+
+        with pytest.raises(ValueError, match="objects are needed") as caught:
+            config.check(of(2))
+        least = int(re.search(r"at least (\d+) objects", str(caught.value))[1])
+        config.check(of(least))
+        assert min(map(len, dataset.split_objects(of(least).collection).values())) >= 1
+        assert min(map(len, dataset.split_objects(of(least - 1).collection).values())) == 0
+
+
+def test_a_split_by_trajectory_needs_two_parts():
+    few = {"num_objects": 1, "num_per_object": 2, "num_full": 0, "shares": (0.7, 0.1, 0.2)}
+    with pytest.raises(ValueError, match=r"trajectories with images is 2, so the part 'test' .* at least 3 traj"):
+        config.check(changed(collection=few, splits=("trajectory",)))
+    config.check(changed(collection={**few, "num_per_object": 3}, splits=("trajectory",)))
 
 
 def test_one_stage_runs_on_the_results_of_the_stages_before_it(tmp_path, monkeypatch):
     ran = []
-    monkeypatch.setattr(stages, "collect", lambda *_: ran.append("collect"))
-    monkeypatch.setattr(stages, "train", lambda *_: ran.append("train"))
-    monkeypatch.setattr(stages, "evaluate", lambda *_: ran.append("evaluate"))
+    monkeypatch.setattr(run, "collect", lambda *_: ran.append("collect"))
+    monkeypatch.setattr(run, "train", lambda *_: ran.append("train"))
+    monkeypatch.setattr(run, "evaluate", lambda *_: ran.append("evaluate"))
     monkeypatch.setattr(dataset, "load", lambda folder: None)
     run.main(freefall.SMOKE, tmp_path, only="collect")
     assert ran == ["collect"]
@@ -152,28 +229,35 @@ def test_one_stage_runs_on_the_results_of_the_stages_before_it(tmp_path, monkeyp
         run.main(freefall.SMOKE, tmp_path, only="evaluate")
     (tmp_path / "models" / "statespace").mkdir(parents=True)
     (tmp_path / "models" / "statespace" / "config.json").write_text("{}")
-    run.main(freefall.SMOKE, tmp_path, only="evaluate")
-    assert ran == ["collect", "train", "evaluate"]
     run.main(freefall.SMOKE, tmp_path)
-    assert ran[3:] == ["collect", "train", "evaluate"]
+    assert ran[2:] == ["collect", "train", "evaluate"]
 
 
 def test_a_work_directory_of_another_configuration_names_the_fields_that_differ(tmp_path):
     run.claim(freefall.SMOKE, tmp_path)
-    other = dataclasses.replace(
-        freefall.SMOKE,
-        image_size=32,
-        collection=dataclasses.replace(freefall.SMOKE.collection, num_objects=20),
-        state_training=dataclasses.replace(freefall.SMOKE.state_training, steps=9),
-        rerolls=2,
-    )
+    steps = dataclasses.replace(freefall.SMOKE.state_training, steps=9)
     with pytest.raises(
         ValueError,
         match=r"config\.json was made with collection\.num_objects = 16, state_training\.steps = 8, image_size = 64, "
         r"but the current settings have collection\.num_objects = 20, state_training\.steps = 9, image_size = 32 "
         r"\(also different: rerolls\): choose another folder",
     ):
-        run.claim(other, tmp_path)
+        run.claim(
+            changed(collection={"num_objects": 20}, state_training=steps, image_size=32, rerolls=2),
+            tmp_path,
+        )
+
+
+def test_a_second_run_in_a_work_directory_is_refused(folder, tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "objects.txt").write_text("of the first\n")
+    with storage.lock(tmp_path / "run"):
+        with pytest.raises(storage.LockedError, match="close what uses the folder in this process"):
+            run.main(freefall.SMOKE, tmp_path / "run")
+        with pytest.raises(storage.LockedError):
+            run.configure(run.Args(tmp_path / "run", smoke_of_few(freefall), objects=folder))
+    assert not (tmp_path / "run" / "config.json").exists()
+    assert (tmp_path / "run" / "objects.txt").read_text() == "of the first\n"
 
 
 @pytest.mark.parametrize("experiment", [freefall, perturbed])
@@ -194,7 +278,7 @@ def test_the_classes_of_the_experiment_or_the_requested_ones_are_taken_from_a_fo
     assert "bottle/3.stl" in listing.read_text()
     assert ("classes left out: box" in listing.read_text()) != bool(asked)
 
-    run.note(listing, ["collect: left out object 0"])  # stays when the folder is read again
+    run.append(listing, ["collect: left out object 0"])  # stays when the folder is read again
     before = listing.stat().st_mtime_ns
     assert run.configure(args).collection == one
     assert listing.stat().st_mtime_ns == before
@@ -205,80 +289,31 @@ def test_all_classes_are_taken_from_a_folder_without_those_of_the_experiment(fol
     meshes = run.configure(small).collection.meshes
     assert meshes is not None
     assert (meshes.scale, meshes.up) == (0.5, "y")
-    with pytest.raises(ValueError, match="--scale and --up apply only to mesh files in a folder"):
-        run.configure(run.Args(tmp_path, perturbed.SMOKE, up="y"))
-
     (folder / "bottle").rename(folder / "jar")
     one = run.configure(run.Args(tmp_path / "run", smoke_of_few(perturbed), objects=folder)).collection
     assert one.meshes is not None
     assert one.meshes.labels == ("box",) * 3 + ("jar",) * 4
 
 
-def test_unknown_classes_and_too_few_objects_are_refused(folder, tmp_path):
+def test_wrong_options_for_objects_are_refused(folder, tmp_path):
     args = run.Args(tmp_path / "run", smoke_of_few(freefall), classes=("bottle", "teapot"))
-    with pytest.raises(ValueError, match=r"category is 'teapot', but it must be one of .*bottle"):
-        run.configure(args)
-    with pytest.raises(ValueError, match=r"teapot.*bottle, box"):
-        run.configure(dataclasses.replace(args, objects=folder))
-    with pytest.raises(ValueError, match=r"num_objects is 3, .* at least 4 objects are needed: add usable objects"):
-        run.configure(dataclasses.replace(args, objects=folder, classes=("box",)))
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"num_objects": 5}, r"num_objects is 5, so the part 'validation' .* at least 6 objects are needed: raise"),
-        ({"num_objects": 0}, "num_objects must be a whole number of at least 1, got 0"),
-        ({"shares": (0.8, 0.0, 0.2)}, r"collection\.shares must be > 0 for train, validation, test, got \(0\.8, 0\.0"),
-        ({"shares": (0.9, 0.1, 0.0)}, r"shares must be > 0"),
-        ({"seed": -1}, "seed must be a whole number of at least 0, got -1"),
-        ({"resolution": (0, 0)}, "resolution must be two whole numbers of pixels"),
-        ({"scenario": physics.Freefall(friction=(0.8, 0.4))}, r"scenario\.friction is \(0\.8, 0\.4\), but"),
-    ],
-)
-def test_a_collection_that_cannot_be_used_is_refused_before_anything_is_written(changes, message, tmp_path):
-    wrong = dataclasses.replace(freefall.SMOKE, collection=dataclasses.replace(freefall.SMOKE.collection, **changes))
-    with pytest.raises(ValueError, match=message):
-        run.configure(run.Args(tmp_path / "run", wrong))
-    with pytest.raises(ValueError, match=message):
-        run.main(wrong, tmp_path / "run")
-    assert not (tmp_path / "run").exists()
-
-
-def test_the_smallest_number_of_objects_in_the_message_is_enough():
-    """For each preset, the number in the message is compared with the split of the dataset."""
-    for experiment in (freefall, inclined, perturbed, released):
-        for preset in experiment.PRESETS.values():
-
-            def of(count, preset=preset):
-                collection = dataclasses.replace(preset.collection, num_objects=count, num_full=0)
-                return dataclasses.replace(preset, collection=collection, splits=("object",))
-
-            with pytest.raises(ValueError, match="objects are needed") as caught:
-                config.check(of(2))
-            least = int(re.search(r"at least (\d+) objects", str(caught.value))[1])
-            config.check(of(least))
-            assert min(map(len, dataset.split_objects(of(least).collection).values())) >= 1
-            assert min(map(len, dataset.split_objects(of(least - 1).collection).values())) == 0
-
-
-def test_a_split_by_trajectory_needs_two_parts():
-    few = dataclasses.replace(
-        freefall.SMOKE.collection, num_objects=1, num_per_object=2, num_full=0, shares=(0.7, 0.1, 0.2)
-    )
-    with pytest.raises(ValueError, match=r"trajectories with images is 2, so the part 'test' .* at least 3 traj"):
-        config.check(dataclasses.replace(freefall.SMOKE, collection=few, splits=("trajectory",)))
-    enough = dataclasses.replace(few, num_per_object=3)
-    config.check(dataclasses.replace(freefall.SMOKE, collection=enough, splits=("trajectory",)))
+    for changes, message in (
+        ({}, r"category is 'teapot', but it must be one of .*bottle"),
+        ({"objects": folder}, r"teapot.*bottle, box"),
+        ({"objects": folder, "classes": ("box",)}, r"is 3, .* at least 4 objects are needed: add usable objects"),
+        ({"classes": (), "up": "y"}, "--scale and --up apply only to mesh files in a folder"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            run.configure(dataclasses.replace(args, **changes))
 
 
 def test_objects_left_out_by_the_collection_are_listed_once(tmp_path, monkeypatch):
-    made = dataset.Collected(0, ("object 1 (bottle): sank", "object 11 (bottle): sank"))
-    monkeypatch.setattr(dataset, "collect", lambda *args, **kwargs: made)
+    collected = dataset.Collected(0, ("object 1 (bottle): sank", "object 11 (bottle): sank"))
+    monkeypatch.setattr(dataset, "collect", lambda *args, **kwargs: collected)
     monkeypatch.setattr(dataset, "load", lambda folder: None)
     for _ in range(2):
         run.collect(freefall.SMOKE, tmp_path, sts.Sensor())
-    listed = "".join(f"collect: left out {line}\n" for line in made.left_out)
+    listed = "".join(f"collect: left out {line}\n" for line in collected.left_out)
     assert (tmp_path / "objects.txt").read_text() == listed
 
 
@@ -292,62 +327,23 @@ def test_the_cache_is_in_the_home_folder_without_xdg_cache_home(told, monkeypatc
     assert compilation.cache_folder() == Path("/home/somebody/.cache/sts_jax")
 
 
-@pytest.mark.parametrize("flag", ["--workdir", "--objects"])
-@pytest.mark.parametrize("name", ["", " "])
-def test_an_empty_name_of_a_folder_is_refused(flag, name, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sys.argv", ["freefall", flag, name])
-    with pytest.raises(SystemExit) as stopped:
-        run.run(freefall.PRESETS, str(tmp_path), None)
-    assert stopped.value.code == 2
-    assert "name of the folder is empty" in " ".join("".join(capsys.readouterr()).replace("│", " ").split())
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_an_error_that_the_user_can_correct_is_one_line_unless_debug_is_set(tmp_path, monkeypatch):
     path = tmp_path / "a.txt"
     path.write_text("")
     monkeypatch.setattr("sys.argv", ["freefall", "--preset", "smoke", "--workdir", str(path)])
-    with pytest.raises(SystemExit, match=rf"^error: cannot create or write to {path}: .*Choose a folder"):
-        run.run(freefall.PRESETS, "unused", None)
-    monkeypatch.setattr("sys.argv", ["freefall", "--classes", "teapot"])
-    with pytest.raises(SystemExit, match=r"^error: category is 'teapot'"):
-        run.run(freefall.PRESETS, str(tmp_path), None)
+    with pytest.raises(SystemExit, match=rf"^error: cannot create or write to {path}: .*Choose a folder") as stopped:
+        run.command(freefall.PRESETS, "unused", None)
+    assert stopped.value.__suppress_context__
     monkeypatch.setattr("sys.argv", ["freefall", "--classes", "teapot", "--debug"])
     with pytest.raises(ValueError, match="teapot"):
-        run.run(freefall.PRESETS, str(tmp_path), None)
+        run.command(freefall.PRESETS, str(tmp_path), None)
 
 
-def locked_twice(folder: Path) -> None:
-    with storage.lock(folder), storage.lock(folder):
-        pass
-
-
-@pytest.mark.parametrize(
-    "refused",
-    [
-        lambda folder: physics.variant(physics.Freefall(), "sideways"),
-        lambda folder: (folder / "none").read_text(),
-        dataset.load,
-        locked_twice,
-    ],
-)
-def test_a_refusal_is_one_line(refused, tmp_path):
-    with pytest.raises(SystemExit, match=r"^error: ") as raised, terminal.on_one_line():
-        refused(tmp_path)
-    assert raised.value.__suppress_context__
-
-
-@pytest.mark.parametrize(
-    ("fault", "kind"),
-    [
-        (lambda: run.configure(None), AttributeError),
-        (lambda: drawing.describe(sts.physics.Freefall(), "cup", {}, {}), KeyError),
-    ],
-)
-def test_an_error_of_the_program_keeps_its_traceback(fault, kind):
-    with pytest.raises(kind), terminal.on_one_line():
-        fault()
+def test_an_error_of_the_program_keeps_its_traceback():
+    with pytest.raises(KeyError), terminal.on_one_line():
+        drawing.describe(physics.Freefall(), "cup", {}, {})
+    with pytest.raises(SystemExit, match="in use"), terminal.on_one_line():
+        raise storage.LockedError("in use")
 
 
 def test_a_warning_is_one_line_and_later_warnings_are_as_before():
@@ -362,39 +358,25 @@ def test_a_warning_is_one_line_and_later_warnings_are_as_before():
     assert formatted() == usual
 
 
-def test_a_second_run_in_a_work_directory_is_refused(tmp_path):
-    with storage.lock(tmp_path), pytest.raises(storage.LockedError, match="close what uses the folder in this process"):
-        run.main(freefall.SMOKE, tmp_path)
-    assert not (tmp_path / "config.json").exists()
-
-
-def test_a_second_run_keeps_the_listing_of_the_first(folder, tmp_path):
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "objects.txt").write_text("of the first\n")
-    with storage.lock(tmp_path / "run"), pytest.raises(storage.LockedError):
-        run.configure(run.Args(tmp_path / "run", smoke_of_few(freefall), objects=folder))
-    assert (tmp_path / "run" / "objects.txt").read_text() == "of the first\n"
+INPUTS = {"dataset": "d" * 64, "models/mvae": "m" * 64}
 
 
 @pytest.fixture
 def evaluated(tmp_path: Path) -> Path:
-    """The results of one model, with a table and a figure."""
+    """The results of one evaluation, with a table and a figure, and a ceiling."""
     (tmp_path / "figures").mkdir()
-    outputs = [tmp_path / "table.md", tmp_path / "figures" / "a.png"]
-    for path in outputs:
+    files = [tmp_path / "table.md", tmp_path / "figures" / "a.png", tmp_path / "ceiling.npz"]
+    for path in files:
         path.write_bytes(path.name.encode())
-    evaluate.write(tmp_path / "metrics.json", {"split": "object"}, INPUTS, outputs)
+    evaluate.record(tmp_path, "ceiling", {"dataset": INPUTS["dataset"]}, files[2:])
+    evaluate.record(tmp_path, "evaluation", INPUTS, files[:2])
     return tmp_path
 
 
-INPUTS = {"dataset": "d" * 64, "models/mvae": "m" * 64}
-
-
 def test_results_are_valid_while_nothing_changes(evaluated):
-    assert evaluate.stale(evaluated / "metrics.json", INPUTS) is None
-    content = json.loads((evaluated / "metrics.json").read_text())
-    assert (content["split"], content["inputs"]) == ("object", INPUTS)
-    assert set(content["outputs"]) == {"table.md", "figures/a.png"}
+    assert evaluate.stale(evaluated, "evaluation", INPUTS) is None
+    assert evaluate.stale(evaluated, "ceiling", {"dataset": INPUTS["dataset"]}) is None
+    assert "no record of the table" in evaluate.stale(evaluated, "table", INPUTS)
 
 
 @pytest.mark.parametrize(
@@ -406,41 +388,30 @@ def test_results_are_valid_while_nothing_changes(evaluated):
     ],
 )
 def test_results_of_other_inputs_are_stale(evaluated, inputs, reason):
-    assert evaluate.stale(evaluated / "metrics.json", inputs) == reason
+    assert evaluate.stale(evaluated, "evaluation", inputs) == reason
 
 
 @pytest.mark.parametrize(
     ("name", "content", "reason"),
     [
-        ("table.md", b"rubbish", "table.md is missing or was changed"),
-        ("table.md", None, "table.md is missing or was changed"),
-        ("figures/a.png", None, "figures/a.png is missing or was changed"),
-        ("metrics.json", None, "metrics.json is missing"),
-        ("metrics.json", b"{", "metrics.json is damaged"),
-        ("metrics.json", b'{"split": "object"}', "metrics.json has no record of its inputs"),
+        ("table.md", b"rubbish", r"table\.md is not the file"),
+        ("figures/a.png", None, r"figures/a\.png is missing"),
+        ("manifest.json", None, r"manifest\.json has no record of the evaluation"),
+        ("manifest.json", b"{", r"manifest\.json cannot be read"),
+        ("manifest.json", b'{"files": {}, "facts": {}, "checksum": "0"}', r"manifest\.json is damaged"),
     ],
 )
-def test_results_that_are_missing_or_changed_are_stale(evaluated, name, content, reason):
+def test_results_that_are_missing_or_changed_are_stale_until_they_are_written_again(evaluated, name, content, reason):
     (evaluated / name).unlink()
     if content is not None:
         (evaluated / name).write_bytes(content)
-    assert evaluate.stale(evaluated / "metrics.json", INPUTS) == reason
+    assert re.search(reason, evaluate.stale(evaluated, "evaluation", INPUTS))
+    (evaluated / "figures" / "a.png").write_bytes(b"new")
+    evaluate.record(evaluated, "evaluation", INPUTS, [evaluated / "figures" / "a.png"])
+    assert evaluate.stale(evaluated, "evaluation", INPUTS) is None
 
 
-def test_a_changed_number_makes_results_stale(evaluated):
-    path = evaluated / "metrics.json"
-    path.write_text(path.read_text().replace('"object"', '"trajectory"'))
-    assert evaluate.stale(path, INPUTS) == "metrics.json was changed"
-
-
-def test_the_identity_of_a_model_depends_on_all_its_files(tmp_path):
-    (tmp_path / "checkpoints" / "1").mkdir(parents=True)
-    weights = tmp_path / "checkpoints" / "1" / "weights"
-    weights.write_bytes(b"1234")
-    before = evaluate.identity(tmp_path)
-    (tmp_path / ".lock").write_bytes(b"")
-    assert evaluate.identity(tmp_path) == before
-    weights.write_bytes(b"1235")
-    changed = evaluate.identity(tmp_path)
-    weights.rename(tmp_path / "weights")
-    assert len({before, changed, evaluate.identity(tmp_path)}) == 3
+def test_damage_stays_visible_when_another_part_is_written(evaluated):
+    (evaluated / "ceiling.npz").write_bytes(b"flipped")
+    evaluate.record(evaluated, "evaluation", INPUTS, [evaluated / "table.md"])
+    assert "ceiling.npz is not the file" in evaluate.stale(evaluated, "ceiling", {"dataset": INPUTS["dataset"]})

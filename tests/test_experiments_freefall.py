@@ -39,7 +39,7 @@ def workdir(tmp_path_factory):
 def test_the_work_directory_has_the_documented_files(workdir):
     names = {path.relative_to(workdir).as_posix() for path in workdir.rglob("*")}
     assert {"config.json", "dataset", "metrics.json", "table.md", "table-full.md"} <= names
-    assert {"ceiling.json", "ceiling.npz"} <= names
+    assert {"manifest.json", "ceiling.npz"} <= names
     assert {f"models/{name}/metrics.jsonl" for name in config.MODELS["paper"]} <= names
     assert {f"figures/{name}.png" for name in ("predictions", "predictions-all", "training", "strip")} <= names
     metrics = json.loads((workdir / "metrics.json").read_text())
@@ -74,16 +74,17 @@ def test_the_work_directory_has_the_documented_files(workdir):
 
 
 def test_the_ceilings_are_computed_once(workdir, monkeypatch):
-    sensor, data = sts.Sensor(), dataset.load(workdir / "dataset")
+    data = dataset.load(workdir / "dataset")
     test = dataset.reduced(data.pairs(evaluation.rows_of(data, "object")["test"]), 64)
-    monkeypatch.setattr(rerolls, "reroll", lambda *_: pytest.fail("computed again"))
-    found = evaluate.ceilings(workdir, "", TINY.collection, sensor, data, test, times=2, num=256, judge=None)
+    monkeypatch.setattr(evaluate, "reroll", lambda *_: pytest.fail("computed again"))
+    split = config.Run(TINY, workdir, sts.Sensor(), "object")
+    ceilings = evaluate.ceilings(split, data, test, judge=None, metrics=evaluation.METRICS)
     metrics = json.loads((workdir / "metrics.json").read_text())["predictors"]["ceiling (mean of re-rolls)"]
-    own = found.scores["ceiling (mean of re-rolls)"]
-    assert own.position.mean() == pytest.approx(metrics["position"]["value"])
-    assert own.best.bce.shape == (len(test.object),)
-    assert found.pose.shape == (2, len(test.object), 7)
-    assert found.scores["one re-roll"].log_loss is None
+    mean = ceilings.scores["ceiling (mean of re-rolls)"]
+    assert mean.position.mean() == pytest.approx(metrics["position"]["value"])
+    assert mean.best.bce.shape == (len(test.object),)
+    assert ceilings.pose.shape == (2, len(test.object), 7)
+    assert ceilings.scores["one re-roll"].log_loss is None
 
 
 def test_a_second_run_leaves_finished_results_unchanged(workdir):
@@ -101,7 +102,8 @@ def test_stale_results_are_computed_again(workdir, capsys):
     assert (metrics.read_text(), table.read_text()) == before
     assert (workdir / "figures" / "strip.png").exists()
     said = capsys.readouterr()
-    assert "evaluate: again, because table.md is missing or was changed\n" in said.err
+    assert "evaluate: again, because " in said.err
+    assert "table.md is not the file that manifest.json lists" in said.err
     assert said.out == before[1] + "\n"
 
     log = workdir / "models" / "mvae" / "metrics.jsonl"  # as another training would leave another one

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from experiments.shared.table2_command import Train
 from recorded_session import record
 
 import sts_jax as sts
 from experiments import real
-from experiments.shared import evaluate, recorded, table2
+from experiments.shared import evaluate, table2
 from experiments.shared.collecting import Collect
 from experiments.shared.config import MODELS
+from experiments.shared.table2 import Train
 from sts_jax import hardware, training
 
 TINY = dataclasses.replace(real.SMOKE, steps=(1, 1, 1), count=6, shifts=1, largest_shift=3)
@@ -36,40 +36,40 @@ def test_options_without_a_sub_command_are_those_of_train():
 
 def test_trajectories_of_a_device_are_split_by_trajectory_and_read_in_the_order_of_their_numbers(tmp_path):
     record(tmp_path / "work", 10)
-    data = recorded.read(TINY, tmp_path / "work")
+    data = table2.read(TINY, tmp_path / "work")
     assert len(data.train.number) == 8
     assert sorted([*data.train.number, *data.validation.number]) == list(range(10))
     assert data.source == "the sensor camera"
-    assert recorded.missing(TINY, tmp_path / "work") == 0  # although there are fewer than count
-    again = recorded.read(TINY, tmp_path / "work")
+    assert table2.missing(TINY, tmp_path / "work") == 0  # although there are fewer than count
+    again = table2.read(TINY, tmp_path / "work")
     np.testing.assert_array_equal(again.validation.visual, data.validation.visual)
-    other = recorded.read(dataclasses.replace(TINY, seed=1), tmp_path / "work")
+    other = table2.read(dataclasses.replace(TINY, seed=1), tmp_path / "work")
     assert other.validation.number.tolist() != data.validation.number.tolist()
     assert other.identity == data.identity
     hardware.discard_recording(tmp_path / "work" / "dataset", 3)
-    assert recorded.read(TINY, tmp_path / "work").identity != data.identity
+    assert table2.read(TINY, tmp_path / "work").identity != data.identity
 
 
 def test_the_source_of_a_twin_is_named(tmp_path):
     record(tmp_path / "work", 5, leds="TWIN0")
-    assert recorded.read(TINY, tmp_path / "work").source == "a digital twin"
+    assert table2.read(TINY, tmp_path / "work").source == "a digital twin"
 
 
 def test_missing_trajectories_and_sensor_files_are_errors_with_a_remedy(tmp_path):
     with pytest.raises(FileNotFoundError, match="holds no session"):
-        recorded.read(TINY, tmp_path)
+        table2.read(TINY, tmp_path)
     record(tmp_path / "few", 3)
     with pytest.raises(ValueError, match="must be >= 5, got 3: collect more"):
-        recorded.read(TINY, tmp_path / "few")
+        table2.read(TINY, tmp_path / "few")
     record(tmp_path / "bare", 5, sensor_file=False)
     with pytest.raises(FileNotFoundError, match=r"sensor.json is missing.*experiments.commission"):
-        recorded.read(TINY, tmp_path / "bare")
+        table2.read(TINY, tmp_path / "bare")
     plain = tmp_path / "few" / "sensor.json"
     content = json.loads(plain.read_text())
     content["device"]["background_tactile"] = None
     plain.write_text(json.dumps(content))
     with pytest.raises(ValueError, match="names no background images"):
-        recorded.read(TINY, tmp_path / "few")
+        table2.read(TINY, tmp_path / "few")
 
 
 @pytest.mark.parametrize(
@@ -78,15 +78,15 @@ def test_missing_trajectories_and_sensor_files_are_errors_with_a_remedy(tmp_path
 )
 def test_a_field_out_of_range_is_refused_before_anything_is_collected(field, value):
     with pytest.raises(ValueError, match=field if field != "image_size" else "50"):
-        recorded.check(dataclasses.replace(TINY, **{field: value}))
+        table2.check(dataclasses.replace(TINY, **{field: value}))
 
 
 def test_copies_move_both_streams_alike_and_the_resting_moment_is_an_input_too(tmp_path):
     record(tmp_path / "work", 5)
-    data = recorded.read(TINY, tmp_path / "work")
-    job = next(job for job in recorded.jobs(TINY, data) if job.name == "mvae-without-pose")
+    data = table2.read(TINY, tmp_path / "work")
+    job = next(job for job in table2.jobs(TINY, data) if job.name == "mvae-without-pose")
     inputs, targets, count = job.arrays.inputs, job.arrays.targets, len(data.train.number)
-    assert len(job.arrays) == recorded.samples(TINY, 5) == 4 * count
+    assert len(job.arrays) == 4 * count
 
     def centres(images):
         dark = np.abs(images[..., 0].astype(int) - data.empty["visual"][..., 0]) > 25
@@ -103,11 +103,11 @@ def test_copies_move_both_streams_alike_and_the_resting_moment_is_an_input_too(t
 
 def test_trajectories_without_any_contact_are_an_error(tmp_path):
     record(tmp_path / "work", 5)
-    data = recorded.read(TINY, tmp_path / "work")
+    data = table2.read(TINY, tmp_path / "work")
     blank = np.broadcast_to(data.empty["tactile"], data.train.tactile.shape).copy()
     data = data._replace(train=data.train._replace(tactile=blank))
     with pytest.raises(ValueError, match="none of the initial tactile images for training shows a contact"):
-        list(recorded.jobs(TINY, data))
+        list(table2.jobs(TINY, data))
 
 
 @pytest.mark.slow
@@ -122,10 +122,10 @@ def test_the_models_are_trained_judged_and_resumed_on_a_device_without_adding_tr
     assert len(hardware.load_recordings(work / "dataset")) == 6
     assert {path.name for path in (work / "table2" / "figures").iterdir()} == {"predictions.png", "training.png"}
 
-    images = recorded.read(TINY, work)
+    images = table2.read(TINY, work)
     first = images.validation.visual[:, 0].astype(np.float32) / 255
     numbers = json.loads((work / "table2" / "metrics.json").read_text())
-    for name in recorded.NAMES:
+    for name in table2.NAMES:
         predict = sts.Predictor.load(work / "table2" / "models" / name)
         assert predict.modalities == MODELS["paper"][name]
         assert predict.preprocessing.touch_level
@@ -141,13 +141,13 @@ def test_the_models_are_trained_judged_and_resumed_on_a_device_without_adding_tr
     bce = -(target * np.log(guess) + (1 - target) * np.log1p(-guess)).mean()
     assert numbers["visual"]["predictors"]["VAE visual only"]["bce"]["value"] == pytest.approx(bce, rel=1e-4)
 
-    identities = {name: evaluate.identity(work / "table2" / "models" / name) for name in recorded.NAMES}
+    identities = {name: evaluate.identity(work / "table2" / "models" / name) for name in table2.NAMES}
     written = (work / "table2" / "metrics.json").stat().st_mtime_ns
     real.main(Train(TINY, work))
     assert (work / "table2" / "metrics.json").stat().st_mtime_ns == written
     (work / "table2" / "table.md").unlink()
     assert table2.evaluate(TINY, images, work, work / "table2") in table
-    assert identities == {name: evaluate.identity(work / "table2" / "models" / name) for name in recorded.NAMES}
+    assert identities == {name: evaluate.identity(work / "table2" / "models" / name) for name in table2.NAMES}
 
     hardware.discard_recording(work / "dataset", 2)
     with pytest.raises(SystemExit, match=r"table2/config.json was made with trajectories.*choose another folder"):

@@ -9,7 +9,7 @@ from extending_page import blocks
 from test_evaluation_scores import judged
 
 from experiments import freefall
-from experiments.shared import config, run
+from experiments.shared import run
 from sts_jax import dataset, evaluation, physics, training
 
 
@@ -158,7 +158,7 @@ def test_another_image_size_goes_through_every_stage(model, side, size, tmp_path
     trained = [own for name, own in predictors.items() if "from visual" in name]
     assert trained
     assert all(np.isfinite(own["visual_skill"]["value"]) for own in trained)
-    folder = config.model_folder(tmp_path, config.main_model(tiny), tiny, "object")
+    folder = tmp_path / "models" / ("statespace" if model == "statespace" else "mvae")
     found = training.load(folder).config
     sizes = [found.image_size] if model == "statespace" else [m.shape[0] for m in found.modalities if m.kind == "image"]
     assert set(sizes) == {size}

@@ -12,7 +12,7 @@ import optax
 import sts_jax as sts
 from sts_jax import dataset, evaluation, mvae, statespace, training
 from sts_jax.dataset.collection import PARTS
-from sts_jax.training import TrainConfig
+from sts_jax.training import Preprocessing, TrainConfig
 
 # The models of each kind and their modalities. The first model of a kind is the main one, which the tables and figures
 # show. The paper's models are the rows of its Table 1.
@@ -71,9 +71,9 @@ class Config:
         return self.state_training if self.model == "statespace" else self.training
 
     @property
-    def preprocessing(self) -> training.Preprocessing:
+    def preprocessing(self) -> Preprocessing:
         """The preprocessing of the models' inputs."""
-        return training.Preprocessing(
+        return Preprocessing(
             self.collection.resolution if self.model == "statespace" else (self.image_size, self.image_size),
             self.collection.crop,
             rotation=self.rotation,
@@ -178,7 +178,6 @@ STATE_TRAINING = TrainConfig(
 
 def smoke(default: Config) -> Config:
     """Reduce a configuration to a short experiment that runs every stage, for tests."""
-    short = {"batch_size": 8, "log_every": 2, "checkpoint_every": 4}
     return dataclasses.replace(
         default,
         collection=dataclasses.replace(
@@ -192,8 +191,10 @@ def smoke(default: Config) -> Config:
             shares=(0.7, 0.1, 0.2),
             seed=0,
         ),
-        training=dataclasses.replace(default.training, **short),
-        state_training=dataclasses.replace(default.state_training, steps=8, warmup=0, **short),
+        training=dataclasses.replace(default.training, batch_size=8, log_every=2, checkpoint_every=4),
+        state_training=dataclasses.replace(
+            default.state_training, steps=8, warmup=0, batch_size=8, log_every=2, checkpoint_every=4
+        ),
         steps=(8, 8, 8, 8),
         rerolls=4,
         num_samples=4,
@@ -329,7 +330,7 @@ def _fits(model: Literal["statespace", "paper"], side: int, size: int) -> bool:
         if model == "statespace":
             statespace.Config(input_size=side, image_size=size)
         else:
-            training.paper_model(("visual",), training.Preprocessing((size, size)))
+            training.paper_model(("visual",), Preprocessing((size, size)))
     except ValueError:
         return False
     return True

@@ -325,7 +325,7 @@ def train_model(
     folder: Path,
     targets: Literal["all", "own"],
     own: Extensions = NONE,
-    progress: Callable[[int, int, dict[str, float]], object] | None = None,
+    progress: Callable[[int, int, dict[str, float]], None] | None = None,
 ) -> None:
     """Train a model in a folder, or continue an interrupted training.
 

@@ -261,9 +261,10 @@ def predictions(models: Mapping[str, Path], data: Recorded) -> dict[str, Predict
     for name, path in models.items():
         predictor = sts.Predictor.load(path)
         for given, subset in evaluation.subsets(predictor.modalities).items():
-            out = predictor(**{stream: first[stream] for stream in subset})
+            out = predictor(**{stream: first[stream] for stream in subset})  # type: ignore[arg-type]
             title = TITLES[name] if len(subset) == len(predictor.modalities) else f"{TITLES[name]}, {given} alone"
-            rows[title] = Predicted(*(None if x is None else np.asarray(x) for x in (out.visual, out.tactile)))
+            visual, tactile = (None if image is None else np.asarray(image) for image in (out.visual, out.tactile))
+            rows[title] = Predicted(visual, tactile)
     return rows
 
 
