@@ -63,17 +63,15 @@ class Config(laying.Config):
 
 
 class Slope(NamedTuple):
-    """The loss of an image, with the gradient and the Gauss-Newton matrix with respect to (x, y, yaw).
+    """The loss of an image, with the gradient and the Gauss-Newton matrix of half the loss in (x, y, yaw).
 
-    r is the vector of the n pixel values of the blurred difference between the image and the target, and J is its
-    Jacobian `dr / d(x, y, yaw)`, of shape (n, 3). The field `loss` is `r^T r / n`. The fields `gradient`, which is
-    `J^T r / n`, and `curvature`, which is `J^T J / n`, are the gradient and the Gauss-Newton matrix of `loss / 2`.
+    r are the n pixel values of the blurred difference between image and target, and J = dr / d(x, y, yaw).
     """
 
     image: jax.Array  # tactile image, shape (h, w, 3)
-    loss: jax.Array  # mean of the squares of r, shape ()
+    loss: jax.Array  # r^T r / n, shape ()
     gradient: jax.Array  # J^T r / n, shape (3,)
-    curvature: jax.Array  # Gauss-Newton matrix J^T J / n, shape (3, 3)
+    curvature: jax.Array  # J^T J / n, shape (3, 3)
 
 
 @functools.partial(jax.jit, static_argnames="resolution")
@@ -85,15 +83,7 @@ def touch(
 
 
 def moved(pose: jax.Array, at: jax.Array) -> jax.Array:
-    """Shift a pose, and turn the pose about the vertical axis through the object's origin.
-
-    Args:
-        pose: Pose of the object in the sensor frame, shape (7,).
-        at: Shift in x and y (m) and turn (rad), shape (3,).
-
-    Returns:
-        New pose, shape (7,).
-    """
+    """Shift a pose by (x, y) (m), and turn it by yaw (rad) about the vertical axis through the object's origin."""
     cos, sin = jnp.cos(at[2] / 2), jnp.sin(at[2] / 2)
     w, x, y, z = pose[3:]
     turn = jnp.stack([cos * w - sin * z, cos * x - sin * y, cos * y + sin * x, cos * z + sin * w])
@@ -101,19 +91,7 @@ def moved(pose: jax.Array, at: jax.Array) -> jax.Array:
 
 
 def carried(wrench: jax.Array, pose: jax.Array, at: jax.Array) -> jax.Array:
-    """Compute the wrench that the pad exerts on the object after a move of the object.
-
-    The force is vertical, and moves with the object.
-
-    Args:
-        wrench: Force (N) and moment about the sensor's origin (N m) that the pad exerts on the object before the move,
-            shape (6,).
-        pose: Pose of the object before the move, shape (7,).
-        at: Shift in x and y (m) and turn (rad) of the object, as in `moved`, shape (3,).
-
-    Returns:
-        Wrench after the move, shape (6,). The force acts at the same point of the object as before the move.
-    """
+    """The wrench (6,) after the pose is `moved`: the force is vertical, and acts at the same point of the object."""
     force = wrench[2]
     x, y = -wrench[4] / force - pose[0], wrench[3] / force - pose[1]
     cos, sin = jnp.cos(at[2]), jnp.sin(at[2])
@@ -133,18 +111,16 @@ def slope(
     *,
     resolution: tuple[int, int],
 ) -> Slope:
-    """Compute the loss of the moved object's image, and the derivatives of half the loss with respect to the move.
+    """The loss of the moved object's image, and its derivatives.
 
-    The loss is the mean of the squared values of the blurred difference between the image and the target. The depth and
-    the tilt of the moved object are computed from the balance of forces in the gel. The derivatives treat the depth and
-    the tilt as constant, because the pad has the same properties at every position.
+    The depth and the tilt of the moved object balance the forces in the gel. The derivatives treat them as constant,
+    because the pad has the same properties at every position.
 
     Args:
         sensor: Constants of the sensor.
         body: The object.
-        pose: Pose of the object before the move, shape (7,).
-        wrench: Force (N) and moment about the sensor's origin (N m) that the pad exerts on the object before the move,
-            shape (6,).
+        pose: Pose before the move, shape (7,).
+        wrench: Wrench on the object before the move, shape (6,).
         at: Shift in x and y (m) and turn (rad), shape (3,).
         target: Tactile image to which the pose is fitted, shape (height, width, 3).
         blur: Standard deviation of the Gaussian blur (m).
@@ -171,8 +147,7 @@ def descend(look: Callable[[np.ndarray, float], Slope], start: np.ndarray) -> li
         start: Initial x (m), y (m) and yaw (rad).
 
     Returns:
-        The accepted points (x, y, yaw), and the result of `look` at each point. The first point is `start`. The last
-        point of one blur occurs again as the first point of the next blur.
+        The accepted points (x, y, yaw) with the results of `look`. The last point of a blur is the first of the next.
     """
     path, at = [], start
     for blur in BLURS:
@@ -199,11 +174,7 @@ def errors(at: np.ndarray) -> tuple[float, float]:
 
 
 def draw(config: Config, target: np.ndarray, paths: list[list[tuple[np.ndarray, Slope]]]) -> None:
-    """Draw five images of the first fit, and the paths of the pose in all fits.
-
-    The images are the target, the rendered images of the poses at the start and at the end of the fit, and the
-    differences of these two images from the target.
-    """
+    """Draw the target, the images at the start and at the end of the first fit, and the paths of all fits."""
     (_, first), (_, last) = paths[0][0], paths[0][-1]
     flat = np.median(target, axis=(0, 1))
     touched = np.abs(np.stack([target, first.image]) - flat).max(axis=(0, -1)) > SEEN
@@ -237,11 +208,7 @@ def draw(config: Config, target: np.ndarray, paths: list[list[tuple[np.ndarray, 
 
 
 def main(config: Config) -> None:
-    """Render a tactile image of the object on the pad, fit the pose to this image several times, and draw the result.
-
-    Raises:
-        ValueError: An option is out of range, or the object leaves no imprint.
-    """
+    """Render a tactile image of the object on the pad, fit the pose to it several times, and draw the result."""
     laying.check(config)
     if config.starts < 1:
         raise ValueError(f"--starts is {config.starts}, but it must be at least 1")
@@ -270,20 +237,20 @@ def main(config: Config) -> None:
             f"by {1e3 * OFF[0]:g} mm: the footprint is nearly round, and its yaw cannot be determined"
         )
     random = np.random.default_rng(config.seed)
-    paths, found = [], 0
+    paths, successes = [], 0
     for number in range(config.starts):
         began, way, sign = time.perf_counter(), random.uniform(0, 2 * np.pi), random.choice([-1, 1])
         start = np.array([OFF[0] * np.cos(way), OFF[0] * np.sin(way), sign * np.deg2rad(OFF[1])])
         path = descend(look, start)
         paths.append(path)
         (far, turned), loss = errors(path[-1][0]), float(path[-1][1].loss)
-        found += far <= 1e3 * GOAL[0] and abs(turned) <= GOAL[1]
+        successes += far <= 1e3 * GOAL[0] and abs(turned) <= GOAL[1]
         print(
             f"start {number}: {1e3 * start[0]:+.2f}, {1e3 * start[1]:+.2f} mm, {sign * OFF[1]:+.0f} degrees off; end: "
             f"{far:.3f} mm, {turned:+.2f} degrees off, loss {loss:.1e}; {time.perf_counter() - began:.0f} s",
             flush=True,
         )
-    print(f"{found} of {config.starts} within {1e3 * GOAL[0]:g} mm and {GOAL[1]:g} degree")
+    print(f"{successes} of {config.starts} within {1e3 * GOAL[0]:g} mm and {GOAL[1]:g} degree")
     draw(config, np.asarray(target), paths)
     print(config.out)
 

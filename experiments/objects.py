@@ -53,17 +53,7 @@ class Config:
 
 @jax.jit(static_argnames=("size",))
 def portrait(body: sts.objects.Body, direction: jax.Array, *, size: int) -> jax.Array:
-    """Render an object in front of a white background.
-
-    Args:
-        body: The object.
-        direction: Direction from the object to the camera, shape (3,). If the object is flat and the z component is
-            between 0 and 0.9, the camera looks down from a higher direction instead.
-        size: Side of the picture (pixels).
-
-    Returns:
-        Picture of shape (size, size, 3).
-    """
+    """Render an object in front of a white background, from a direction (3,). Flat objects are seen from higher up."""
     extent = jnp.max(body.vertices, 0) - jnp.min(body.vertices, 0)
     flat = (extent[2] < 0.3 * jnp.maximum(extent[0], extent[1])) & (direction[2] > 0) & (direction[2] < 0.9)
     direction = direction + jnp.where(flat, jnp.array([0.0, 0.0, 0.5]), jnp.zeros(3))
@@ -83,29 +73,16 @@ def portrait(body: sts.objects.Body, direction: jax.Array, *, size: int) -> jax.
 
 
 def describe(category: str, number: int, body: sts.objects.Body, *, parts: bool) -> str:
-    """Describe one object in one line of text, in the format of `sts.objects.describe`.
-
-    Args:
-        category: Class of the object.
-        number: Number of the object.
-        body: The object.
-        parts: If True, an object whose hull fits badly is first decomposed into convex parts, as
-            `dataset.make_bodies` does.
-    """
-    found = sts.objects.facts(body, apart := sts.objects.gaps(body))
+    """Describe one object in one line. With `parts`, an object whose hull fits badly is decomposed first."""
+    facts = sts.objects.facts(body, apart := sts.objects.gaps(body))
     if parts and apart[1] > sts.objects.HOLLOW:
         body = sts.objects.decompose(body)
-        found = [*sts.objects.facts(body, sts.objects.gaps(body)), f"as one hull {found[-1]}"]
-    return f"{category}  {number}: " + "; ".join(found)
+        facts = [*sts.objects.facts(body, sts.objects.gaps(body)), f"as one hull {facts[-1]}"]
+    return f"{category}  {number}: " + "; ".join(facts)
 
 
 def main(config: Config) -> None:
-    """Make the objects, print their descriptions, and draw them in one picture.
-
-    Raises:
-        ValueError: `num` is less than 1, a class is unknown, or `out` does not have the suffix of a picture file.
-        OSError: The picture cannot be written.
-    """
+    """Make the objects, print their descriptions, and draw them in one picture."""
     if config.num < 1:
         raise ValueError(f"--num is {config.num}, but the number of objects per class must be at least 1")
     families = {category: sts.objects.find_family(category) for category in config.categories}
@@ -114,8 +91,8 @@ def main(config: Config) -> None:
     drawn = []
     for category, family in families.items():
         for number in range(config.num):
-            own = jax.random.fold_in(jax.random.fold_in(key, family.seed), number)
-            drawn.append((category, sts.objects.make(own, category)))
+            object_key = jax.random.fold_in(jax.random.fold_in(key, family.seed), number)
+            drawn.append((category, sts.objects.make(object_key, category)))
     if config.shuffle:
         order = np.asarray(jax.random.permutation(key, len(drawn)))
         drawn = [drawn[i] for i in order]

@@ -47,12 +47,7 @@ def see(
 
 
 def look(config: Config, sensor: sts.Sensor, body: sts.objects.Body) -> tuple[sts.Frame, np.ndarray, str]:
-    """Place and render the object.
-
-    Returns:
-        A tuple `(frame, between, text)`. `frame` has all outputs of the sensor. `between` is a further image, with the
-        LEDs at `config.light` times full power. `text` describes the pose, the imprint and the speed.
-    """
+    """Place and render the object: all outputs, the image with dimmed LEDs, and a text about pose, imprint and time."""
     pose, wrench, words = lay(config, sensor, body)
     given = sensor, body, jnp.asarray(pose, jnp.float32), jnp.asarray(wrench, jnp.float32)
     seconds = []
@@ -73,16 +68,9 @@ def look(config: Config, sensor: sts.Sensor, body: sts.objects.Body) -> tuple[st
 
 
 def panels(frame: sts.Frame, between: np.ndarray, light: float) -> list[tuple[str, np.ndarray]]:
-    """Return a list of images in [0, 1] with their captions.
+    """The captions and images in [0, 1] of a frame, and of the image with the LEDs at `light` times full power.
 
-    The images are the visual image, the image with dimmed LEDs, the tactile image, the depth, the segmentation and the
-    pressure on the gel. In the depth image, near points are bright. The pressure image has the resolution of the gel's
-    grid.
-
-    Args:
-        frame: Visual image, tactile image and true quantities of an object on the sensor.
-        between: Image of the same object with dimmed LEDs.
-        light: Power of the LEDs in `between`, as a share of full power.
+    In the depth image, near points are bright. The pressure image has the resolution of the gel's grid.
     """
     seen = np.asarray(frame.segmentation)
     depth = np.where(seen, np.asarray(frame.depth), np.nan)
@@ -102,12 +90,7 @@ def panels(frame: sts.Frame, between: np.ndarray, light: float) -> list[tuple[st
 
 
 def compose(pictures: list[tuple[str, np.ndarray]], columns: int) -> Image.Image:
-    """Arrange images in rows, each with a caption above.
-
-    Args:
-        pictures: Captions and images. Images of other sizes are scaled to fit the size of the first image.
-        columns: Number of images in a row.
-    """
+    """Arrange captions and images in rows of `columns`, all scaled to fit the size of the first image."""
     height, width = pictures[0][1].shape[:2]
     times = -(-NARROWEST // width)
     height, width = height * times, width * times
@@ -125,12 +108,7 @@ def compose(pictures: list[tuple[str, np.ndarray]], columns: int) -> Image.Image
 
 
 def main(config: Config) -> None:
-    """Make the object, place it on the pad, render it, print a description, and draw the outputs.
-
-    Raises:
-        ValueError: An option is out of range, or the mesh file is refused.
-        OSError: A file cannot be read or written.
-    """
+    """Make the object, place it on the pad, render it, print a description, and draw the outputs."""
     check(config)
     sensor = sts.Sensor() if config.sensor is None else sts.Sensor.load(config.sensor)
     names = sts.objects.CATEGORIES if config.mesh == "classes" else (config.mesh,)

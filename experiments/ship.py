@@ -37,16 +37,8 @@ class Args:
 def ship(workdir: Path, name: str) -> str:
     """Copy the trained model of a work directory to `sts_jax/models/NAME`, with rounded weights.
 
-    Args:
-        workdir: Work directory with a trained state-space model.
-        name: Name of the model in the library.
-
     Returns:
         A line with the size of the copy, and the differences between predictions of the original and of the copy.
-
-    Raises:
-        ValueError: The model is too large, or the name is not a Python identifier.
-        OSError: A file of the model is damaged or missing, or the library's folder cannot be written to.
     """
     if not name.isidentifier():
         raise ValueError(
@@ -72,10 +64,7 @@ def ship(workdir: Path, name: str) -> str:
 
 
 def compare(original: sts.Predictor, rounded: sts.Predictor) -> str:
-    """Return a line of text with the differences between the predictions of two models.
-
-    Both models predict from the same visual images, which `bottles` renders.
-    """
+    """A line with the largest differences between predictions of two models from images of `bottles`."""
     visual = bottles(original.preprocessing)
     half = np.array(original.preprocessing.condition_scale, np.float32) / 2
     condition = np.tile(half, (len(visual), 1)) if half.size else None
@@ -89,14 +78,7 @@ def compare(original: sts.Predictor, rounded: sts.Predictor) -> str:
 
 
 def bottles(view: sts.training.Preprocessing) -> np.ndarray:
-    """Render visual images of bottles, alternately at rest on the pad and in the air.
-
-    Args:
-        view: Preprocessing of the model, which determines the resolution and the crop.
-
-    Returns:
-        Images of shape (NUM, height, width, 3) in [0, 1].
-    """
+    """Render visual images of bottles, alternately at rest on the pad and in the air, (NUM, height, width, 3)."""
     sensor, images = sts.Sensor(), []
     for number in range(NUM):
         body = sts.objects.make(jax.random.key(number), "bottle")

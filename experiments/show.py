@@ -21,10 +21,7 @@ from experiments.shared import drawing, terminal
 from sts_jax import dataset, evaluation
 
 SCENARIOS = {
-    "freefall": freefall.DEFAULT.collection,
-    "inclined": inclined.DEFAULT.collection,
-    "perturbed": perturbed.DEFAULT.collection,
-    "released": released.DEFAULT.collection,
+    one.__name__.rpartition(".")[2]: one.DEFAULT.collection for one in (freefall, inclined, perturbed, released)
 }
 
 
@@ -40,12 +37,7 @@ class Config:
 
 
 def main(config: Config) -> None:
-    """Simulate the trajectories, render them from outside and through the sensor, and draw them.
-
-    Raises:
-        ValueError: The scenario is unknown, or `config.num` is less than 1.
-        OSError: The folder `config.out` cannot be written to.
-    """
+    """Simulate the trajectories, render them from outside and through the sensor, and draw them."""
     if config.scenario not in SCENARIOS:
         raise ValueError(f"scenario is {config.scenario!r}, but it must be one of {', '.join(SCENARIOS)}")
     if config.num < 1:

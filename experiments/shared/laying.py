@@ -50,12 +50,7 @@ class Config:
 
 
 def check(config: Config) -> None:
-    """Check the options before any work.
-
-    Raises:
-        ValueError: An option is out of range.
-        OSError: The picture cannot be written.
-    """
+    """Check the options before any work."""
     if min(config.resolution) < 1:
         raise ValueError(f"--resolution is {config.resolution}, but height and width must be at least 1 pixel")
     numbers = {
@@ -76,16 +71,7 @@ def check(config: Config) -> None:
 
 
 def read(config: Config, name: str) -> sts.objects.Body:
-    """Load the object from a mesh file, or generate an object of an object class such as `bottle`.
-
-    Args:
-        config: Options of the command line.
-        name: Path of a mesh file, or name of an object class.
-
-    Raises:
-        FileNotFoundError: The name is neither a file nor an object class.
-        ValueError: An option for mesh files is given for an object class, or `objects.load` refuses the file.
-    """
+    """Load the object from a mesh file, or make one of an object class such as `bottle`."""
     if name not in sts.objects.CATEGORIES:
         path = Path(name)
         if not path.exists() and not path.suffix:
@@ -120,11 +106,7 @@ def lay(config: Config, sensor: sts.Sensor, body: sts.objects.Body) -> tuple[np.
     """Place the object at rest (`physics.place`), then tilt, turn and move it as the options require.
 
     Returns:
-        Three values. The first value is the pose of the object in the sensor frame, shape (7,). The second value is the
-        force and moment that the pad exerts on the object, shape (6,). The third value describes how the object rests.
-
-    Raises:
-        ValueError: The object has no face with the index `rest`.
+        Its pose (7,), the wrench of the pad on it (6,), and a description of how it rests.
     """
     shares = sts.physics.stable_faces(body, fill=FILL).share
     if not 0 <= config.rest < len(shares):
