@@ -212,7 +212,7 @@ def sessions(args: Args) -> hardware.Recordings:
         levels=ON,
         commissioned=datetime.date.today().isoformat(),
         lens_from="ideal",
-    ).save(args.workdir, sts.Sensor().constants())
+    ).save(args.workdir, sts.Sensor())
     return hardware.load_recordings(args.workdir / "clean")
 
 

@@ -181,12 +181,8 @@ def views(config: Config, source: Source, first: hardware.Shot) -> Views:
         return Views(hardware.Lens.ideal(width, height), sts.Sensor().camera, None)
     device = hardware.Device.load(source.file)
     pinhole = sts.Sensor.load(hardware.sensor_file.sensor_file(source.file)).camera
-    backgrounds = None
-    if device.background_visual is not None and device.background_tactile is not None:
-        backgrounds = Backgrounds(
-            device.background(source.file, "visual"), device.background(source.file, "tactile"), config.flat
-        )
-    return Views(device.lens, pinhole, backgrounds)
+    empty = device.backgrounds(source.file)
+    return Views(device.lens, pinhole, None if empty is None else Backgrounds(*empty, config.flat))
 
 
 def images(config: Config, source: Source) -> Iterator[hardware.Shot]:

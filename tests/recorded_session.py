@@ -53,7 +53,7 @@ def record(workdir, count, *, leds="0123", sensor_file=True, seed=0):
     if sensor_file:
         device = hardware.Device("camera", 30.0, leds, LENS, 0.1, 0.1, LEVELS, "2026-05-31", lens_from="ideal")
         empty = raw(drawn(None, None))
-        device.save(workdir, sts.Sensor().constants(), visual=empty, tactile=empty)
+        device.save(workdir, sts.Sensor(), (empty, empty))
     origin = hardware.Origin("camera", leds, SIZE[1], SIZE[0], LEVELS)
     with hardware.Session.open(workdir / "dataset", origin) as session:
         for row, column in places:

@@ -169,8 +169,8 @@ def test_an_interrupted_run_resumes_and_writes_a_file_that_opens_the_sensor(peer
     assert (device.lens_from, device.exposures) == ("board", None)
     assert device.settle_on_s > peer.camera.lag_s + peer.camera.exposure_s
     np.testing.assert_allclose(device.lens.center, TRUE.center, atol=1e-3)
-    assert abs(float(np.median(device.background(config.out, "visual"))) - DARK - 2) <= 2
-    assert abs(float(np.median(device.background(config.out, "tactile"))) - LIT - 2) <= 2
+    assert abs(float(np.median(device.backgrounds(config.out)[0])) - DARK - 2) <= 2
+    assert abs(float(np.median(device.backgrounds(config.out)[1])) - LIT - 2) <= 2
     assert sts.Sensor.load(config.out / "sensor.json").constants() == sts.Sensor().constants()
 
     peer.camera.board = None

@@ -71,7 +71,7 @@ def test_sides_without_a_match_share_no_group(folder, tmp_path, capsys):
 def test_raw_images_are_rectified_with_the_lens_of_the_sensor_file(folder, tmp_path):
     lens = hardware.Lens.ideal(SIZE[1], SIZE[0])
     device = hardware.Device("camera", 30.0, "0123", lens, 0.1, 0.1, (255, 255, 255, 255), "2026-05-31")
-    device.save(tmp_path, sts.Sensor().constants())
+    device.save(tmp_path, sts.Sensor())
     real, simulated = command.load(config(folder, folder, tmp_path, sensor=tmp_path))
     raw = pair(3, "final", SIZE).tactile.image
     np.testing.assert_array_equal(real.images.tactile[7], hardware.rectified(lens, sts.Sensor().camera, raw, SIZE))

@@ -251,7 +251,7 @@ def test_a_replay_with_a_model_of_the_library(tmp_path, capsys):
     """The whole command. The recording is of a grey pad with a dark spot, so the images are far from any training."""
     folder = tmp_path / "made"
     device = hardware.Device("http://127.0.0.1:1/camera", 30.0, "LEDS", LENS, 0.1, 0.1, (255,) * 4, "2026-05-31")
-    device.save(tmp_path, sts.Sensor().constants(), visual=grey(100), tactile=grey(180))
+    device.save(tmp_path, sts.Sensor(), (grey(100), grey(180)))
     with hardware.Recorder(folder, ORIGIN, file=tmp_path) as recorder:
         for number in range(40):
             recorder.add(dataclasses.replace(shot(number), image=spotted(180 if number % 2 else 100)))

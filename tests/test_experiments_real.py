@@ -122,8 +122,8 @@ def sensor_file(peer, path):
         levels=(255, 255, 255, 255),
         commissioned="2026-05-31",
     )
-    images = (np.full((SIZE[1], SIZE[0], 3), level, np.uint8) for level in (DARK, LIT))
-    device.save(path, sts.Sensor().constants(), visual=next(images), tactile=next(images))
+    dark, lit = (np.full((SIZE[1], SIZE[0], 3), level, np.uint8) for level in (DARK, LIT))
+    device.save(path, sts.Sensor(), (dark, lit))
     return path
 
 

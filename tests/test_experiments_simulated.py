@@ -1,6 +1,5 @@
 """`real collect --twin`, and the sensor file of a work directory."""
 
-import json
 import math
 
 import numpy as np
@@ -71,11 +70,11 @@ def test_the_sensor_file_of_the_twin_rectifies_to_the_simulated_view(tmp_path):
     assert sts.Sensor.load(tmp_path / "sensor.json").constants() == sts.Sensor().constants()
     assert (made.width, made.height, made.leds, made.lens_from) == (320, 240, "TWIN0", "ideal")
     for shot in (pair.visual, pair.tactile):
-        background = made.background(tmp_path, shot.stream)
+        background = made.backgrounds(tmp_path)[shot.stream == "tactile"]
         assert np.abs(background - shot.image.astype(float)).mean() < 2
     assert np.abs(empty.visual - sts.hardware.proof.thumbnail(pair.visual.image)).mean() < 1
     # The object's middle, seen through the lens of the file, lies at the place of its pose.
-    dark = np.abs(made.background(tmp_path, "visual") - held.visual.image.astype(float)).mean(-1)
+    dark = np.abs(made.backgrounds(tmp_path)[0] - held.visual.image.astype(float)).mean(-1)
     view = hardware.rectified(made.lens, sts.Sensor().camera, (255 * (dark > 30)).astype(np.uint8)[..., None], (96, 96))
     rows, columns = np.nonzero(view.reshape(96, 96) > 127)
     side = 2 * float(sts.Sensor().camera.distance) * 0.75
@@ -112,8 +111,8 @@ def file(tmp_path):
         levels=(255, 255, 255, 255),
         commissioned="2026-05-31",
     )
-    images = {stream: np.full((24, 32, 3), level, np.uint8) for stream, level in (("visual", 40), ("tactile", 90))}
-    device.save(tmp_path / "bench.json", sts.Sensor().constants(), **images)
+    images = [np.full((24, 32, 3), level, np.uint8) for level in (40, 90)]
+    device.save(tmp_path / "bench.json", sts.Sensor(), tuple(images))
     return tmp_path / "bench.json"
 
 
@@ -124,21 +123,20 @@ def test_a_work_directory_keeps_its_sensor_file(file, tmp_path):
         collecting.keep(file, workdir)
         file_content = file.read_bytes()
         assert (workdir / "sensor.json").read_bytes() == file_content
-        assert hardware.Device.load(workdir).background(workdir, "tactile").mean() == 90
+        assert hardware.Device.load(workdir).backgrounds(workdir)[1].mean() == 90
     image = np.full((24, 32, 3), 91, np.uint8)
-    hardware.Device.load(file).save(file, sts.Sensor().constants(), tactile=image)
+    hardware.Device.load(file).save(file, sts.Sensor(), (image, image))
     with pytest.raises(ValueError, match=r"sensor\.json differs from .*bench\.json.*choose another --workdir"):
         collecting.keep(file, workdir)
-    assert hardware.Device.load(workdir).background(workdir, "tactile").mean() == 90
+    assert hardware.Device.load(workdir).backgrounds(workdir)[1].mean() == 90
 
 
 def test_a_sensor_file_with_other_constants_is_refused(file, tmp_path):
     workdir = tmp_path / "run"
     workdir.mkdir()
     collecting.keep(file, workdir)
-    content = json.loads(file.read_text())
-    content["gel"]["max_depth"] = 0.002
-    file.write_text(json.dumps(content))
+    sensor = sts.Sensor(camera=sts.optics.Camera(distance=0.12))
+    hardware.Device.load(file).save(file, sensor)
     with pytest.raises(ValueError, match=r"sensor\.json differs from .*bench\.json.*choose another --workdir"):
         collecting.keep(file, workdir)
 

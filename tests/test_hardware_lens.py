@@ -2,8 +2,6 @@
 
 import dataclasses
 import math
-import re
-from pathlib import Path
 
 import cv2
 import jax.numpy as jnp
@@ -102,7 +100,7 @@ def test_a_polynomial_that_bends_back_is_used_up_to_its_largest_value():
     assert np.isfinite(pixels[1]).all()
     assert np.isnan(hardware.distortion(lens, PINHOLE, (48, 64))[0, 0]).all()
     bent = dataclasses.replace(lens, k=(-0.6, 0.0, 0.0, 0.0))
-    with pytest.raises(ValueError, match=r"valid up to 42\.7 degrees .* Calibrate the lens again"):
+    with pytest.raises(ValueError, match=r"valid up to 42\.7 degrees .* calibrate the lens again"):
         hardware.rectification(bent, PINHOLE, (48, 64))
 
 
@@ -156,6 +154,8 @@ def test_rays_that_do_not_meet_the_pad_are_nan_in_the_distortion():
 
 
 # ---- Images
+
+IMAGE = np.zeros((480, 640, 3), np.uint8)
 
 
 def smooth_image(resolution):
@@ -244,48 +244,20 @@ def test_parts_of_the_view_that_the_camera_does_not_see_are_black():
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("make", "message"),
     [
-        ({"width": 0}, "width must be an int >= 1, got 0"),
-        ({"height": 480.0}, "height must be an int"),
-        ({"fx": -1.0}, r"fx must be > 0, got -1\.0"),
-        ({"cy": math.nan}, "cy must be a finite int or float, got nan"),
-        ({"k": (0.0, 0.0)}, "k must be a tuple of 4 finite ints or floats"),
-        ({"k": (0.0, math.inf, 0.0, 0.0)}, "k must be a tuple of 4 finite ints or floats"),
-        ({"rotation": (0.0, 0.0)}, "rotation must be a tuple of 3 finite ints or floats"),
-        ({"translation": (0.0, 0.0, -0.1)}, r"translation\[2\] must be > 0 m"),
-        ({"rotation": (math.pi, 0.0, 0.0)}, r"place the camera at .* must lie inside the sensor, where z is negative"),
+        (lambda: dataclasses.replace(IDEAL, width=0), "width must be > 0, got 0"),
+        (lambda: dataclasses.replace(IDEAL, fx=-1.0), r"fx must be > 0, got -1\.0"),
+        (lambda: dataclasses.replace(IDEAL, k=(0.0, math.nan, 0.0, 0.0)), "must be finite, got Lens.*nan"),
+        (lambda: dataclasses.replace(IDEAL, translation=(0.0, 0.0, -0.1)), r"translation\[2\] must be > 0 m"),
+        (lambda: dataclasses.replace(IDEAL, rotation=(math.pi, 0.0, 0.0)), "place the camera at .* must lie inside"),
+        (lambda: Lens.ideal(640, 480, field_of_view=0.0), "field_of_view must be"),
+        (lambda: hardware.rectified(IDEAL, PINHOLE, IMAGE[:50], (48, 64)), "640x50 pixels, but the lens .* 640x480"),
+        (lambda: hardware.rectified(IDEAL, PINHOLE, IMAGE / 255, (48, 64)), "image"),
+        (lambda: hardware.project(IDEAL, np.zeros((3, 2))), "points"),
+        (lambda: hardware.distorted(IDEAL, PINHOLE, IMAGE, outside=0, samples=0), "samples must be >= 1"),
     ],
 )
-def test_an_invalid_lens_raises_an_error_that_names_the_field(changes, message):
-    # The tests' type checker comes before the library's own check.
-    with pytest.raises((ValueError, TypeCheckError), match=f"{message}|Lens.__init__"):
-        dataclasses.replace(IDEAL, **changes)
-
-
-def test_invalid_arguments_raise_errors():
-    image = np.zeros((480, 640, 3), np.uint8)
-    with pytest.raises(
-        ValueError, match="the image has 100x50 pixels, but the lens was calibrated with images of 640x480"
-    ):
-        hardware.rectified(IDEAL, PINHOLE, np.zeros((50, 100, 3), np.uint8), (48, 64))
-    with pytest.raises(ValueError, match="image must be a uint8 NumPy array of shape"):
-        hardware.distorted(IDEAL, PINHOLE, np.zeros((2, 48, 64, 3), np.uint8), outside=0)
-    with pytest.raises(ValueError, match="resolution must be"):
-        hardware.rectified(IDEAL, PINHOLE, image, (0, 64))
-    with pytest.raises(ValueError, match="samples must be >= 1"):
-        hardware.distorted(IDEAL, PINHOLE, image, outside=0, samples=0)
-    with pytest.raises(ValueError, match="field_of_view must be"):
-        Lens.ideal(640, 480, field_of_view=0.0)
-    with pytest.raises(ValueError, match="points must have shape"):
-        hardware.project(IDEAL, np.zeros((3, 2)))
-    with pytest.raises(ValueError, match="pinhole must have distance > 0"):
-        hardware.rectification(IDEAL, dataclasses.replace(PINHOLE, fov=4.0), (48, 64))
-
-
-def test_the_lens_and_its_file_import_no_jax():
-    folder = Path(hardware.__file__).parent
-    for name in ("lens.py", "calibration.py", "sensor_file.py"):
-        text = (folder / name).read_text()
-        allowed = r"^\s*(import|from) (jax|sts_jax(?!\.hardware|\.storage| import storage$))"
-        assert not re.search(allowed, text, re.MULTILINE), name
+def test_a_wrong_lens_or_image_is_named(make, message):
+    with pytest.raises((ValueError, TypeCheckError), match=f"(?s){message}"):
+        make()

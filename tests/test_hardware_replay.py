@@ -409,7 +409,7 @@ def test_a_recorded_sensor_replays_with_its_sensor_file(tmp_path):
                 recorder.add(one)
         replay = hardware.Replay.from_file(tmp_path / "made", speed=None)
         assert replay.device == hardware.Device.load(file)
-        assert replay.device.background(tmp_path / "made", "tactile").mean() == pytest.approx(210)
+        assert replay.device.backgrounds(tmp_path / "made")[1].mean() == pytest.approx(210)
         with replay:
             found = played(replay)
         assert len(found) == 10

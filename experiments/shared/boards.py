@@ -11,9 +11,8 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, UnidentifiedImageError
 
-from sts_jax import hardware, storage
-from sts_jax.hardware.calibration import FEWEST_CORNERS, FEWEST_IMAGES
-from sts_jax.hardware.coverage import PARTS
+from sts_jax import hardware, optics, storage
+from sts_jax.hardware.calibration import FEWEST_CORNERS, FEWEST_IMAGES, PARTS
 
 STILL = 1.0  # largest median movement of the corners between two frames of a board that is held still (pixels)
 _FIRST = "000.png"  # picture of the board on the pad
@@ -112,7 +111,7 @@ class Pictures:
             f", not yet {', '.join(missing)}" if missing else ""
         )
 
-    def fit(self, pinhole: hardware.Pinhole) -> hardware.Calibration:
+    def fit(self, pinhole: optics.Camera) -> hardware.Calibration:
         """Calibrate the lens, and check that the lens and the pictures cover the view of the sensor.
 
         The view is the part of the gel's outer face that rectified images show.

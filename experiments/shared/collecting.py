@@ -5,7 +5,6 @@ import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
-import sts_jax as sts
 from experiments.shared import simulated
 from experiments.shared.page import Page
 from experiments.shared.run import Folder
@@ -88,9 +87,8 @@ def commissioned(config: Collect, file: Path) -> tuple[hardware.STS, EmptyPad | 
     device = hardware.Device.load(file)
     camera = device.camera_config(config.camera)
     camera = dataclasses.replace(camera, lock=config.lock and camera.lock, fourcc=config.fourcc or camera.fourcc)
-    empty = None
-    if device.background_visual is not None and device.background_tactile is not None:
-        empty = hardware.known_pad(device.background(file, "visual"), device.background(file, "tactile"))
+    backgrounds = device.backgrounds(file)
+    empty = None if backgrounds is None else hardware.known_pad(*backgrounds)
     return hardware.STS.from_file(file, camera=camera, leds=config.leds), empty
 
 
@@ -179,20 +177,14 @@ def keep(file: Path, workdir: Path) -> None:
         SensorFileError: A sensor file or a background image is damaged.
         OSError: The sensor file does not exist, or a file cannot be written.
     """
-    file, copy = hardware.sensor_file.sensor_file(file), workdir / hardware.sensor_file.NAME
-    device = hardware.Device.load(file)
-    if copy.exists():
-        kept = hardware.Device.load(copy)
-        if kept != device or sts.Sensor.load(copy).constants() != sts.Sensor.load(file).constants():
-            raise ValueError(
-                f"{copy} differs from {file}, but one sensor file must describe all trajectories of a work directory: "
-                "choose another --workdir"
-            )
-        return
-    for background in (device.background_visual, device.background_tactile):
-        if background is not None:
-            storage.write_bytes(workdir / background.name, file.with_name(background.name).read_bytes())
-    storage.write_bytes(copy, file.read_bytes())
+    checksums = hardware.sensor_file.checksums
+    if not (workdir / storage.MANIFEST).exists():  # the manifest is the last file of a copy
+        hardware.copy_sensor(file, workdir)
+    elif sorted(checksums(workdir).values()) != sorted(checksums(file).values()):
+        raise ValueError(
+            f"{workdir / hardware.sensor_file.NAME} differs from {file}, but one sensor file must describe all "
+            "trajectories of a work directory: choose another --workdir"
+        )
 
 
 @contextlib.contextmanager

@@ -132,7 +132,7 @@ def expose(config: Config, camera: hardware.OpenCVCamera, leds: hardware.Leds) -
     return (chosen[0], chosen[1]) if settable else None
 
 
-def ideal(config: Config, pinhole: hardware.Pinhole) -> hardware.Lens:
+def ideal(config: Config, pinhole: sts.optics.Camera) -> hardware.Lens:
     """Make an ideal lens with the field of view of the option `--ideal-lens`, instead of a calibrated lens.
 
     An ideal lens is equidistant, and its optical axis is perpendicular to the pad and meets the centre of the pad.
@@ -152,7 +152,7 @@ def ideal(config: Config, pinhole: hardware.Pinhole) -> hardware.Lens:
     return lens
 
 
-def fit(pictures: boards.Pictures, pinhole: hardware.Pinhole) -> hardware.Lens:
+def fit(pictures: boards.Pictures, pinhole: sts.optics.Camera) -> hardware.Lens:
     """Calibrate the lens from pictures of the board, and print the error of each picture.
 
     Raises:
@@ -174,7 +174,7 @@ def fit(pictures: boards.Pictures, pinhole: hardware.Pinhole) -> hardware.Lens:
     return calibration.lens
 
 
-def live(config: Config, sensor: hardware.STS, pinhole: hardware.Pinhole) -> hardware.Lens:
+def live(config: Config, sensor: hardware.STS, pinhole: sts.optics.Camera) -> hardware.Lens:
     """Take the missing pictures of the board, and calibrate the lens from all pictures in OUT/board.
 
     Raises:
@@ -242,7 +242,7 @@ def commission(config: Config) -> None:
     """
     check(config)
     simulated, size = sts.Sensor(), (config.width, config.height)
-    pinhole: hardware.Pinhole = simulated.camera
+    pinhole = simulated.camera
     lens: hardware.Lens | None = None
     if config.ideal_lens is not None:
         lens = ideal(config, pinhole)
@@ -291,7 +291,7 @@ def commission(config: Config) -> None:
                 focus=camera.locked.get("focus"),
                 lens_from=source,
             )
-    device.save(config.out, simulated.constants(), visual=recorded.visual, tactile=recorded.tactile)
+    device.save(config.out, simulated, (recorded.visual, recorded.tactile))
     print(f"{config.out / hardware.sensor_file.NAME}: camera {device.camera}, controller {device.leds}, lens {source}")
     print(
         f"next, in Python: `with sts_jax.hardware.STS.from_file({str(config.out)!r}) as sensor: pair = sensor.read()`"

@@ -67,7 +67,7 @@ class Views:
     """The conversion from raw images to rectified images, which show the view of the sensor's pinhole camera."""
 
     lens: hardware.Lens  # lens of the raw images
-    pinhole: hardware.Pinhole  # view of the sensor
+    pinhole: sts.optics.Camera  # view of the sensor
     backgrounds: Backgrounds | None  # images of the empty pad, if they are known
 
     def shown(self, image: Image) -> Image:

@@ -168,7 +168,9 @@ def commissioned(config: Simulated, device: twin.Twin) -> tuple[twin.VirtualSens
         )
     settling = hardware.Settling(there.settle_off_s, there.settle_on_s)
     sensor = twin.VirtualSensor(device, levels=config.levels, settling=settling)
-    return sensor, hardware.known_pad(there.background(file, "visual"), there.background(file, "tactile"))
+    backgrounds = there.backgrounds(file)
+    assert backgrounds is not None, "`commission` has recorded them"
+    return sensor, hardware.known_pad(*backgrounds)
 
 
 def commission(config: Simulated, device: twin.Twin) -> None:
@@ -188,4 +190,4 @@ def commission(config: Simulated, device: twin.Twin) -> None:
         lens_from="ideal",
     )
     config.workdir.mkdir(parents=True, exist_ok=True)
-    made.save(config.workdir, simulated.constants(), visual=recorded.visual, tactile=recorded.tactile)
+    made.save(config.workdir, simulated, (recorded.visual, recorded.tactile))

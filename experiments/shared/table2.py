@@ -129,7 +129,7 @@ def missing(config: Config, workdir: Path) -> int:
 def read(config: Config, workdir: Path) -> Recorded:
     """Read the confirmed trajectories of a work directory, rectify the images, and hold out validation trajectories."""
     recordings = hardware.load_recordings(workdir / "dataset")
-    device, sensor = sensor_file(workdir)
+    device, sensor, backgrounds = sensor_file(workdir)
     if len(recordings) < LEAST:
         raise ValueError(
             f"the number of confirmed trajectories in {recordings.folder} must be >= {LEAST}, got {len(recordings)}: "
@@ -145,8 +145,8 @@ def read(config: Config, workdir: Path) -> Recorded:
             progress=lambda done, total: bar("read", done, total),
         )
     empty = {
-        stream: hardware.rectified(device.lens, sensor.camera, device.background(workdir, stream), size)
-        for stream in ("visual", "tactile")
+        stream: hardware.rectified(device.lens, sensor.camera, image, size)
+        for stream, image in zip(("visual", "tactile"), backgrounds, strict=True)
     }
     order = np.random.default_rng(config.seed).permutation(len(recordings))
     cut = min(max(round((1 - config.held_out) * len(order)), 1), len(order) - 1)
@@ -156,26 +156,26 @@ def read(config: Config, workdir: Path) -> Recorded:
     # The serial number of a twin's LED controller begins with TWIN.
     is_twin = recordings.origin.leds.startswith("TWIN")
     source = "a digital twin" if is_twin else f"the sensor {recordings.origin.camera}"
-    # The sensor file has the checksums of the background images.
-    content = {"dataset": recordings.identity, "sensor": storage.sha256(workdir / "sensor.json")}
+    content = {"dataset": recordings.identity, "sensor": hardware.sensor_file.checksums(workdir)}
     return Recorded(train, validation, empty, storage.digest(content), source)
 
 
-def sensor_file(workdir: Path) -> tuple[hardware.Device, sts.Sensor]:
-    """Read the sensor file of a work directory: the device, which must have backgrounds, and the constants."""
+def sensor_file(workdir: Path) -> tuple[hardware.Device, sts.Sensor, tuple[np.ndarray, np.ndarray]]:
+    """Read the sensor file of a work directory: the device, the constants, and the raw images of the empty pad."""
     path = workdir / "sensor.json"
     if not path.exists():
         raise FileNotFoundError(
-            f"the sensor file {path} is missing: copy this file and the background images (images of the empty pad) "
-            "into the work directory. `python -m experiments.commission` writes these files"
+            f"the sensor file {path} is missing: copy all files of its folder, which `experiments.commission` writes, "
+            "into the work directory"
         )
     device = hardware.Device.load(path)
-    if device.background_visual is None or device.background_tactile is None:
+    backgrounds = device.backgrounds(path)
+    if backgrounds is None:
         raise ValueError(
-            f"{path} names no background images (images of the empty pad), but they are needed to find contacts: run "
-            "`python -m experiments.commission` again, and copy the sensor file and its images into the work directory"
+            f"{path.parent} has no images of the empty pad, but they are needed to find contacts: run "
+            "`python -m experiments.commission` again, and copy its files into the work directory"
         )
-    return device, sts.Sensor.load(path)
+    return device, sts.Sensor.load(path), backgrounds
 
 
 def jobs(config: Config, data: Recorded) -> Iterator[Job]:

@@ -1,7 +1,19 @@
-"""The real sensor: camera, LED controller, calibration, and recording. Only its digital twin, `twin`, uses JAX."""
+"""The real sensor: camera, LED controller, calibration, recording, and its digital twin `twin`."""
 
-from sts_jax.hardware.board import Board, FoundCorners, board_image, find_board, save_board
-from sts_jax.hardware.calibration import Calibration, CalibrationError, calibrate, fit_lens
+from sts_jax.hardware.calibration import (
+    Board,
+    Calibration,
+    CalibrationError,
+    FoundCorners,
+    board_image,
+    calibrate,
+    check_view,
+    covered,
+    find_board,
+    fit_lens,
+    save_board,
+    view_angle,
+)
 from sts_jax.hardware.camera import (
     CameraBusyError,
     CameraConfig,
@@ -23,7 +35,6 @@ from sts_jax.hardware.camera import (
     is_black,
 )
 from sts_jax.hardware.collecting import Action, AutomaticPerson, PairReader, Person, View, collect
-from sts_jax.hardware.coverage import check_view, covered, view_angle
 from sts_jax.hardware.guide import EmptyPad, GuideConfig, Stage, known_pad
 from sts_jax.hardware.leds import (
     DisconnectedError,
@@ -39,12 +50,22 @@ from sts_jax.hardware.leds import (
     WrongVersionError,
     find_controllers,
 )
-from sts_jax.hardware.lens import Lens, Pinhole, distorted, distortion, project, rectification, rectified
+from sts_jax.hardware.lens import (
+    Lens,
+    SensorView,
+    distorted,
+    distortion,
+    project,
+    rectification,
+    rectified,
+    relit,
+    sensor_view,
+)
 from sts_jax.hardware.opencv import OpenCVCamera
 from sts_jax.hardware.proof import LightError, NoContrastError, NotStillError, Pair, Settling, Shot
 from sts_jax.hardware.recorder import Recorder
 from sts_jax.hardware.replay import Replay
-from sts_jax.hardware.sensor_file import Background, Device, SensorFileError, WrongDeviceError
+from sts_jax.hardware.sensor_file import Device, SensorFileError, WrongDeviceError, copy_sensor
 from sts_jax.hardware.session import (
     Entry,
     Origin,
@@ -58,16 +79,15 @@ from sts_jax.hardware.session import (
     list_recordings,
     load_recordings,
     next_recording,
+    recorded_images,
     restore_recording,
 )
 from sts_jax.hardware.sts import STS, Exposed, FoundSensors, brightness, choose_exposure, find_sensors
-from sts_jax.hardware.views import SensorView, recorded_images, relit, sensor_view
 
 __all__ = [
     "STS",
     "Action",
     "AutomaticPerson",
-    "Background",
     "Board",
     "Calibration",
     "CalibrationError",
@@ -108,7 +128,6 @@ __all__ = [
     "Pair",
     "PairReader",
     "Person",
-    "Pinhole",
     "Port",
     "PortInUseError",
     "PortNotFoundError",
@@ -136,6 +155,7 @@ __all__ = [
     "choose_exposure",
     "collect",
     "confirm_recording",
+    "copy_sensor",
     "covered",
     "discard_recording",
     "distorted",

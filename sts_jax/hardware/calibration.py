@@ -1,22 +1,31 @@
-"""Calibration of a fisheye lens and of the camera's pose in the sensor, from images of a printed ChArUco board."""
+"""The printed ChArUco board, and the calibration of a fisheye lens and its pose in the sensor from images of it."""
 
 import dataclasses
 import math
+import os
 from collections.abc import Sequence
+from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from jaxtyping import Float, Int, UInt8
+from PIL import Image
 from scipy import optimize
 from scipy.spatial.transform import Rotation
 
-from sts_jax.hardware.board import Board, FoundCorners, find_board
-from sts_jax.hardware.lens import Lens, distort_angle
+from sts_jax import storage
+from sts_jax._checked import checked
+from sts_jax.hardware.lens import Lens, distort_angle, rectification, window
+from sts_jax.optics import Camera
 
 FEWEST_IMAGES = 6  # least number of usable images
 FEWEST_CORNERS = 12  # least number of corners in a usable image
 LEAST_TILT = math.radians(15)  # least angle between the two boards that differ most (rad)
 MOST_TILT_ON_PAD = math.radians(30)  # largest angle between the board on the pad and the image (rad)
+
+_PAGE = (210, 297)  # width and height of A4 (mm)
+_PIXELS_PER_MM = 10
+_RULER = 100  # length of the printed ruler (mm)
 
 _STARTS = np.radians(np.arange(60, 221, 10))  # fields of view across the diagonal that the first estimate tries (rad)
 _WIDEST = math.radians(80)  # corners beyond this angle are not used in the first estimate of a pose (rad)
@@ -26,9 +35,151 @@ _WIDEST = math.radians(80)  # corners beyond this angle are not used in the firs
 # orthographic projections, k1 to k4 have absolute values of at most 0.17, 0.01, 0.001 and 0.0001.
 _PRIOR = np.array([0.5, 1.0, 2.0, 5.0])
 
+_RESOLUTION = 480, 640  # height and width of the view at which it is checked (pixels)
+_EXTRAPOLATION = math.radians(3)  # largest angle by which the view may exceed the corners of all boards (rad)
+# Share of the image's width and height that belongs to each outer part. A lens of 160 degrees shows the border of the
+# view there, and a board on the pad does not reach it.
+_OUTER = 0.2
+_ROWS = "top", "middle", "bottom"
+_COLUMNS = "left", "centre", "right"
+PARTS = tuple(f"{row} {column}" for row in _ROWS for column in _COLUMNS)
+
+_SHARP = "check that `board` is the printed board, sharp, evenly lit, not overexposed, and mostly in view"
+
 
 class CalibrationError(ValueError):
-    """Raised if a lens cannot be calibrated, or does not show the whole pad. The message states the remedy."""
+    """A lens cannot be calibrated, or does not show the whole pad. The message states the remedy."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Board:
+    """A ChArUco board: a chessboard with an ArUco marker in each white square.
+
+    The frame of the board has its origin at the centre. On the printed side, x points to the right, y points downwards,
+    and z points into the paper.
+    """
+
+    columns: int = 9  # number of squares in a row, at least 4
+    rows: int = 9  # number of squares in a column, at least 4
+    square: float = 0.016  # side of a square (m)
+    marker: float = 0.012  # side of a marker (m)
+    dictionary: str = "DICT_4X4_50"  # name of one of OpenCV's predefined dictionaries of markers
+
+    def __post_init__(self) -> None:
+        if min(self.columns, self.rows) < 4:
+            raise ValueError(f"columns and rows must be >= 4, got {self.columns} and {self.rows}")
+        if not 0 < self.marker < self.square < 1:
+            raise ValueError(f"0 < marker < square < 1 m must hold, got marker={self.marker} and square={self.square}")
+        if not self.dictionary.startswith("DICT_") or not hasattr(cv2.aruco, self.dictionary):
+            raise ValueError(f"dictionary must be one of OpenCV's, such as 'DICT_4X4_50', got {self.dictionary!r}")
+        needed, available = self.columns * self.rows // 2, len(self._markers().bytesList)
+        if needed > available:
+            raise ValueError(
+                f"{self.columns}x{self.rows} squares need {needed} markers, but {self.dictionary} has {available}: "
+                "choose a larger dictionary or fewer squares"
+            )
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height of the board (m)."""
+        return self.columns * self.square, self.rows * self.square
+
+    @property
+    def corners(self) -> Float[np.ndarray, "n 3"]:
+        """Positions of the inner corners of the chessboard in the board's frame (m), row by row."""
+        middle = np.array([*self.size, 0.0]) / 2
+        return np.asarray(self.opencv().getChessboardCorners(), np.float64) - middle
+
+    def opencv(self) -> "cv2.aruco.CharucoBoard":
+        """Return the same board as an OpenCV object, whose frame has its origin at the top left corner."""
+        return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, self.marker, self._markers())
+
+    def _markers(self) -> "cv2.aruco.Dictionary":
+        return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
+
+
+@dataclasses.dataclass(frozen=True)
+class FoundCorners:
+    """The corners of a board that were found in an image."""
+
+    numbers: Int[np.ndarray, "n"]  # row of each corner in `Board.corners`
+    pixels: Float[np.ndarray, "n 2"]  # raw pixel coordinates (column, row) of each corner
+
+
+def board_image(
+    board: Board = Board(), *, outline: tuple[float, float] = (0.15, 0.15)
+) -> UInt8[np.ndarray, "2970 2100"]:
+    """Draw an A4 page with the board, a frame to cut along, all dimensions as text, and a ruler of 100 mm.
+
+    Args:
+        board: The board to draw.
+        outline: Width and height of the frame (m). With those of the gel pad, the cut sheet covers the pad exactly.
+
+    Returns:
+        Grey image with 10 pixels per mm.
+    """
+    frame = [round(1000 * side * _PIXELS_PER_MM) for side in outline]
+    pixels = [round(1000 * side * _PIXELS_PER_MM) for side in board.size]
+    largest = _PAGE[0] - 10, _PAGE[1] - 60
+    if pixels[0] > frame[0] or pixels[1] > frame[1]:
+        raise ValueError(f"the board of {_mm(board.size)} does not fit into outline={_mm(outline)}: use fewer squares")
+    if any(side > _PIXELS_PER_MM * limit for side, limit in zip(frame, largest, strict=True)):
+        raise ValueError(
+            f"outline is {_mm(outline)}, but must be at most {largest[0]} mm x {largest[1]} mm to fit on the A4 page"
+        )
+    page = np.full((_PAGE[1] * _PIXELS_PER_MM, _PAGE[0] * _PIXELS_PER_MM), 255, np.uint8)
+    left, top = (page.shape[1] - frame[0]) // 2, 10 * _PIXELS_PER_MM
+    cv2.rectangle(page, (left - 1, top - 1), (left + frame[0], top + frame[1]), 160, 1)
+    x, y = left + (frame[0] - pixels[0]) // 2, top + (frame[1] - pixels[1]) // 2
+    page[y : y + pixels[1], x : x + pixels[0]] = board.opencv().generateImage((pixels[0], pixels[1]))
+    row = top + frame[1] + 10 * _PIXELS_PER_MM
+    for line in (
+        f"{board.columns} x {board.rows} squares of {1000 * board.square:g} mm, markers of {1000 * board.marker:g} mm "
+        f"({board.dictionary})",
+        f"Board {_mm(board.size)}, grey frame {_mm(outline)}",
+        f"Print at 100 %. The line below is {_RULER} mm long.",
+    ):
+        cv2.putText(page, line, (left, row), cv2.FONT_HERSHEY_SIMPLEX, 1.2, 0, 2, cv2.LINE_AA)
+        row += 7 * _PIXELS_PER_MM
+    cv2.rectangle(page, (left, row), (left + _RULER * _PIXELS_PER_MM - 1, row + 4), 0, -1)
+    for end in (left, left + _RULER * _PIXELS_PER_MM - 1):
+        cv2.line(page, (end, row - 20), (end, row + 24), 0, 1)
+    return page
+
+
+def save_board(path: str | os.PathLike, board: Board = Board(), *, outline: tuple[float, float] = (0.15, 0.15)) -> None:
+    """Save the page of `board_image` as .pdf or .png, whose print at 100 % has the true size."""
+    path = Path(path)
+    if path.suffix.lower() not in (".pdf", ".png"):
+        raise ValueError(f"path must end in .pdf or .png, got {path}")
+    page = Image.fromarray(board_image(board, outline=outline))
+    dots_per_inch = 25.4 * _PIXELS_PER_MM
+
+    def write(temporary: Path) -> None:
+        if path.suffix.lower() == ".pdf":
+            page.save(temporary, "PDF", resolution=dots_per_inch)
+        else:
+            page.save(temporary, "PNG", dpi=(dots_per_inch, dots_per_inch))
+
+    storage.write_whole(path, write)
+
+
+@checked
+def find_board(image: UInt8[np.ndarray, "rows columns *channels"], board: Board = Board()) -> FoundCorners:
+    """Find the corners of a board in a raw RGB or grey image. If the board is not found, the arrays are empty."""
+    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.adaptiveThreshWinSizeMax = max(23, 3 + gray.shape[1] // 160 * 10)  # markers grow with the image
+    detector = cv2.aruco.CharucoDetector(board.opencv(), cv2.aruco.CharucoParameters(), parameters)
+    pixels, numbers, _, _ = detector.detectBoard(gray)
+    if pixels is None or numbers is None:
+        return FoundCorners(np.zeros(0, np.int64), np.zeros((0, 2)))
+    return FoundCorners(numbers.reshape(-1).astype(np.int64), pixels.reshape(-1, 2).astype(np.float64))
+
+
+def _mm(size: Sequence[float]) -> str:
+    """A size in m as a text such as "150 mm x 150 mm"."""
+    return " x ".join(f"{1000 * side:g} mm" for side in size)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,97 +193,59 @@ class Calibration:
 
 
 def calibrate(
-    images: Sequence[NDArray[np.uint8]],
-    board: Board = Board(),
-    *,
-    on_pad: int = 0,
-    largest_error: float = 1.0,
+    images: Sequence[UInt8[np.ndarray, "..."]], board: Board = Board(), *, on_pad: int = 0, largest_error: float = 1.0
 ) -> Calibration:
-    """Calibrate a lens and the camera's pose in the sensor from images of a board.
+    """Calibrate a lens and the camera's pose in the sensor from raw images of a board.
 
-    In one image, the board must lie on the outer face of the gel pad, with the printed side towards the camera. The
-    board must be centred on the pad, with its edges parallel to the edges of the pad. Any edge of the board may be at
-    the top of the image. Among the other images, the distance, position and tilt of the board must vary.
-
-    The calibration fits the parameters of the lens and the pose of the board in each image. For each corner, it
-    compares the pixel at which the corner was found with the pixel to which the fitted lens projects the corner. The
-    distance between these two pixels is the reprojection error. The fit minimises a soft L1 loss of the differences
-    in column and row between these pixels. A weak prior keeps the coefficients `Lens.k` small.
+    In one image, the board must lie on the outer face of the gel pad, with the print towards the camera, centred, and
+    with its edges parallel to those of the pad (in any of the four orientations). Among the other images, the distance,
+    position and tilt of the board must vary.
 
     Args:
-        images: Raw images of one camera, all of the same size, shape (height, width, 3) for RGB or (height, width) for
-            grey, uint8. At least 6 of the images must each show at least 12 corners of the board.
+        images: Raw images of one camera and one size, RGB or grey. At least 6 must show 12 corners of the board or
+            more.
         board: The printed board.
         on_pad: Index in `images` of the image in which the board lies on the pad.
         largest_error: Largest allowed root mean square of the reprojection errors of an image (pixels).
 
-    Returns:
-        The lens with the camera's pose relative to the pad, and the root mean square of the reprojection errors of each
-        image.
-
     Raises:
-        CalibrationError: Too few images show at least 12 corners of the board, the board has nearly the same tilt in
-            all images, or the reprojection errors of an image exceed `largest_error`. This error is also raised if, in
-            the image with the index `on_pad`, fewer than 12 corners are found, the plane of the board is tilted against
-            the image plane by more than 30 degrees, or the edges of the board are rotated against the edges of the
-            image by more than 30 degrees.
-        ValueError: The images have different sizes or are not uint8, or `on_pad` is not the index of an image.
+        CalibrationError: The images do not determine the lens. The message names the images.
     """
-    height, width = _common_size(images)
-    found = [find_board(image, board) for image in images]
-    return fit_lens(found, (width, height), board, on_pad=on_pad, largest_error=largest_error)
+    if len({image.shape[:2] for image in images}) > 1:
+        names = ", ".join(f"{w}x{h}" for h, w in sorted({image.shape[:2] for image in images}))
+        raise ValueError(f"all images must have the same size, got {names} pixels: use one setting of the camera")
+    height, width = images[0].shape[:2] if images else (1, 1)
+    corners = [find_board(image, board) for image in images]
+    return fit_lens(corners, (width, height), board, on_pad=on_pad, largest_error=largest_error)
 
 
 def fit_lens(
-    found: Sequence[FoundCorners],
+    corners: Sequence[FoundCorners],
     size: tuple[int, int],
     board: Board = Board(),
     *,
     on_pad: int = 0,
     largest_error: float = 1.0,
 ) -> Calibration:
-    """Calibrate a lens as `calibrate` does, but from the results of `find_board` instead of images.
+    """Calibrate a lens as `calibrate` does, from the corners of `find_board` in raw images of the width and height.
 
-    Args:
-        found: Corners of the board in each image, from `find_board`.
-        size: Width and height of the raw images (pixels).
-        board: The printed board.
-        on_pad: Index in `found` of the image in which the board lies on the sensor's gel pad.
-        largest_error: Largest allowed root mean square of the reprojection errors of an image (pixels).
-
-    Returns:
-        The lens with the camera's pose relative to the pad, and the root mean square of the reprojection errors of each
-        image.
-
-    Raises:
-        CalibrationError: Too few images show at least 12 corners of the board, the board has nearly the same tilt in
-            all images, or the reprojection errors of an image exceed `largest_error`. This error is also raised if, in
-            the image with the index `on_pad`, fewer than 12 corners are found, the plane of the board is tilted against
-            the image plane by more than 30 degrees, or the edges of the board are rotated against the edges of the
-            image by more than 30 degrees.
-        ValueError: `on_pad` is not the index of an image.
+    The fit minimises a soft L1 loss of the distances between the found corners and their projections.
     """
     width, height = size
-    if not 0 <= on_pad < max(1, len(found)):
-        raise ValueError(
-            f"on_pad must be the index of an image, counted from 0, got {on_pad} (number of images: {len(found)})"
-        )
-    if len(found) < FEWEST_IMAGES:
+    if not 0 <= on_pad < max(1, len(corners)):
+        raise ValueError(f"on_pad must be the index of an image, got {on_pad} (number of images: {len(corners)})")
+    if len(corners) < FEWEST_IMAGES:
         raise CalibrationError(
             f"a calibration needs at least {FEWEST_IMAGES} images of the board in different poses, but only "
-            f"{len(found)} images are given. Take more images."
+            f"{len(corners)} are given: take more images"
         )
-    counts = tuple(len(corners.numbers) for corners in found)
+    counts = tuple(len(found.numbers) for found in corners)
     used = _usable(counts, on_pad)
-    views = _Views.of([found[i] for i in used], board)
-    start = _first_estimate(views, width, height)
-    fit = _fitted(views, start)
-    root_mean_squares = [
-        math.sqrt(float(np.mean(np.sum(fit.residuals[views.image == i] ** 2, axis=-1)))) for i in range(len(used))
-    ]
-    errors: list[float | None] = [None] * len(found)
-    for i, error in zip(used, root_mean_squares, strict=True):
-        errors[i] = error
+    views = _Views.of([corners[i] for i in used], board)
+    fit = _fitted(views, _first_estimate(views, width, height))
+    errors: list[float | None] = [None] * len(corners)
+    for row, i in enumerate(used):
+        errors[i] = math.sqrt(float(np.mean(np.sum(fit.residuals[views.image == row] ** 2, axis=-1))))
     _check_errors(errors, largest_error)
     _check_tilts(fit.poses)
     rotation, translation = _pose_on_pad(fit.poses[used.index(on_pad)], on_pad)
@@ -144,19 +257,19 @@ def fit_lens(
 class _Views:
     """The corners of all usable images, concatenated."""
 
-    image: NDArray[np.int64]  # index of each corner's image among the usable images, shape (n,)
-    points: NDArray[np.float64]  # position of each corner in the board's frame (m), shape (n, 3)
-    pixels: NDArray[np.float64]  # raw pixel coordinates of each corner, shape (n, 2)
+    image: np.ndarray  # index of each corner's image among the usable images, shape (n,)
+    points: np.ndarray  # position of each corner in the board's frame (m), shape (n, 3)
+    pixels: np.ndarray  # raw pixel coordinates of each corner, shape (n, 2)
     number: int  # number of usable images
 
     @classmethod
-    def of(cls, found: list[FoundCorners], board: Board) -> "_Views":
-        corners = board.corners
+    def of(cls, corners: list[FoundCorners], board: Board) -> "_Views":
+        points = board.corners
         return cls(
-            image=np.repeat(np.arange(len(found)), [len(f.numbers) for f in found]),
-            points=np.concatenate([corners[f.numbers] for f in found]),
-            pixels=np.concatenate([f.pixels for f in found]),
-            number=len(found),
+            image=np.repeat(np.arange(len(corners)), [len(found.numbers) for found in corners]),
+            points=np.concatenate([points[found.numbers] for found in corners]),
+            pixels=np.concatenate([found.pixels for found in corners]),
+            number=len(corners),
         )
 
 
@@ -167,17 +280,17 @@ class _Fit:
     focal: tuple[float, float]  # fx and fy (pixels per radian)
     center: tuple[float, float]  # cx and cy (pixels)
     k: tuple[float, float, float, float]  # k1 to k4 of the lens
-    poses: NDArray[np.float64]  # rotation vector (rad) and translation (m) from board to camera, shape (images, 6)
-    residuals: NDArray[np.float64]  # projections minus found corners (pixels), shape (n, 2)
+    poses: np.ndarray  # rotation vector (rad) and translation (m) from board to camera, shape (images, 6)
+    residuals: np.ndarray  # projections minus found corners (pixels), shape (n, 2)
     largest_angle: float  # largest angle of a corner from the optical axis (rad)
 
     @property
-    def unknowns(self) -> NDArray[np.float64]:
+    def unknowns(self) -> np.ndarray:
         """Focal lengths, centre, k and the poses of m images as one vector, shape (8 + 6 m,)."""
         return np.concatenate([self.focal, self.center, self.k, self.poses.ravel()])
 
     @classmethod
-    def of(cls, views: _Views, unknowns: NDArray[np.float64]) -> "_Fit":
+    def of(cls, views: _Views, unknowns: np.ndarray) -> "_Fit":
         """Project the corners with the lens and the poses in `unknowns`, and compute the residuals."""
         fx, fy, cx, cy, k1, k2, k3, k4 = unknowns[:8].tolist()
         poses = unknowns[8:].reshape(-1, 6)
@@ -216,70 +329,33 @@ def _first_estimate(views: _Views, width: int, height: int) -> _Fit:
             if best is None or np.abs(fit.residuals).mean() < np.abs(best.residuals).mean():
                 best = fit
     if best is None:
-        raise CalibrationError(
-            "the pose of the board cannot be computed from the corners that were found in the images. Check that "
-            "`board` and the printed board have the same numbers of squares and the same dictionary. Take images that "
-            "show more of the board."
-        )
+        raise CalibrationError(f"the pose of the board cannot be computed from the corners that were found: {_SHARP}")
     return best
 
 
 def _fitted(views: _Views, start: _Fit) -> _Fit:
     """Minimise the residuals of the corners and of the prior, beginning at `start`."""
 
-    def residuals(unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
+    def residuals(unknowns: np.ndarray) -> np.ndarray:
         return np.concatenate([_Fit.of(views, unknowns).residuals.ravel(), _PRIOR * unknowns[4:8]])
 
     result = optimize.least_squares(residuals, start.unknowns, x_scale="jac", loss="soft_l1", max_nfev=200)
     return _Fit.of(views, result.x)
 
 
-def _common_size(images: Sequence[NDArray[np.uint8]]) -> tuple[int, int]:
-    """Height and width of the images, or an error if they have different sizes or another type."""
-    if not images:
-        raise CalibrationError(
-            f"`images` is empty. Take at least {FEWEST_IMAGES} images of the board in different poses."
-        )
-    for i, image in enumerate(images):
-        if image.dtype != np.uint8 or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)):
-            raise ValueError(
-                f"image {i} must be uint8 of shape (height, width) or (height, width, 3), got {image.dtype} of shape "
-                f"{image.shape}. Read the image with `Camera.read` or from a PNG file."
-            )
-    sizes = {image.shape[:2] for image in images}
-    if len(sizes) > 1:
-        names = ", ".join(f"{w}x{h}" for h, w in sorted(sizes))
-        raise ValueError(
-            f"all images must have the same size, got the sizes {names} (width x height in pixels). Take all images "
-            "with the same camera settings."
-        )
-    height, width = images[0].shape[:2]
-    return height, width
-
-
 def _usable(counts: tuple[int, ...], on_pad: int) -> list[int]:
     """The indices of the images with enough corners. Raises an error if they are too few or `on_pad` is missing."""
     used = [i for i, count in enumerate(counts) if count >= FEWEST_CORNERS]
-    missing = [i for i, count in enumerate(counts) if count == 0]
-    few = [f"{i} ({count} corners)" for i, count in enumerate(counts) if 0 < count < FEWEST_CORNERS]
-    lacking = ""
-    if missing:
-        lacking += f" The board was not found in {_listed(missing)}."
-    if few:
-        lacking += f" Fewer than {FEWEST_CORNERS} corners were found in {_listed(few)}."
-    remedy = (
-        " Check that `board` describes the printed board, that the board is sharp, evenly lit and not overexposed, and "
-        "that most of it is in view."
-    )
+    poor = [f"{i} ({count} corners)" for i, count in enumerate(counts) if count < FEWEST_CORNERS]
     if on_pad not in used:
         raise CalibrationError(
-            f"on_pad is {on_pad}, so image {on_pad} must show at least {FEWEST_CORNERS} corners of the board, but it "
-            f"shows {counts[on_pad]}.{lacking}{remedy}"
+            f"image {on_pad} must show the board on the pad with at least {FEWEST_CORNERS} corners, but it shows "
+            f"{counts[on_pad]}: set on_pad, or {_SHARP}"
         )
     if len(used) < FEWEST_IMAGES:
         raise CalibrationError(
-            f"only {len(used)} of {len(counts)} images show at least {FEWEST_CORNERS} corners of the board, but at "
-            f"least {FEWEST_IMAGES} such images are needed.{lacking}{remedy}"
+            f"only {len(used)} of {len(counts)} images show at least {FEWEST_CORNERS} corners of the board, but "
+            f"{FEWEST_IMAGES} are needed. Too few corners were found in {_listed(poor)}: {_SHARP}"
         )
     return used
 
@@ -289,29 +365,25 @@ def _check_errors(errors: list[float | None], largest: float) -> None:
     bad = [f"{i} ({error:.2f} pixels)" for i, error in enumerate(errors) if error is not None and error > largest]
     if bad:
         raise CalibrationError(
-            f"largest_error is {largest:g} (pixels), but the root mean square of the reprojection errors is larger in "
-            f"{_listed(bad)}. If only a few images are listed, leave them out: they may be blurred, or the board may "
-            "have moved. If most images are listed, check that the board is flat, that its squares have the size "
-            "`Board.square`, and that focus and image size were the same for all images."
+            f"the reprojection error is larger than largest_error = {largest:g} pixels in {_listed(bad)}: leave these "
+            "images out if they are few. Otherwise check that the board is flat, that its squares have the size "
+            "`Board.square`, and that focus and image size were the same for all images"
         )
 
 
-def _check_tilts(poses: NDArray[np.float64]) -> None:
+def _check_tilts(poses: np.ndarray) -> None:
     """Raise an error if the boards are nearly parallel in all images."""
     normals = Rotation.from_rotvec(poses[:, :3]).as_matrix()[:, :, 2]
     spread = math.acos(float(np.clip((normals @ normals.T).min(), -1, 1)))
     if spread < LEAST_TILT:
         raise CalibrationError(
-            "the largest difference between the tilts of the board in any two images is "
-            f"{math.degrees(spread):.0f} degrees, but at least {math.degrees(LEAST_TILT):.0f} degrees are needed to "
-            "compute the focal length. Tilt the board by 20 to 40 degrees in some images, each time in a different "
-            "direction."
+            f"the tilts of the board differ by at most {math.degrees(spread):.0f} degrees, but the focal length needs "
+            f"{math.degrees(LEAST_TILT):.0f} degrees: tilt the board by 20 to 40 degrees, each time in another "
+            "direction"
         )
 
 
-def _pose_on_pad(
-    pose: NDArray[np.float64], index: int
-) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+def _pose_on_pad(pose: np.ndarray, index: int) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     """The rotation vector and the translation from the sensor frame to the camera frame.
 
     The sensor frame is the frame of the board on the pad, turned by a multiple of 90 degrees so that x points to the
@@ -329,10 +401,9 @@ def _pose_on_pad(
     for angle, words in ((tilt, "tilted against"), (abs(twist), "rotated in")):
         if angle > MOST_TILT_ON_PAD:
             raise CalibrationError(
-                f"the board of image {index} is {words} the image plane by {math.degrees(angle):.0f} degrees, but at "
-                f"most {math.degrees(MOST_TILT_ON_PAD):.0f} degrees are allowed for a board on the pad. Set `on_pad` "
-                "to the index of the image in which the board lies on the pad, or mount the camera so that the "
-                "image plane is parallel to the pad and the edges of the pad are horizontal and vertical in the image."
+                f"the board of image {index} is {words} the image plane by {math.degrees(angle):.0f} degrees, but a "
+                f"board on the pad by at most {math.degrees(MOST_TILT_ON_PAD):.0f} degrees: set on_pad to the image "
+                "with the board on the pad, or mount the camera parallel to the pad and its edges"
             )
     (x, y, z), (tx, ty, tz) = sensor.as_rotvec().tolist(), pose[3:].tolist()
     return (x, y, z), (tx, ty, tz)
@@ -341,3 +412,64 @@ def _pose_on_pad(
 def _listed(names: Sequence[object]) -> str:
     """A text such as "images 2, 5"."""
     return f"image{'s' if len(names) > 1 else ''} {', '.join(map(str, names))}"
+
+
+def view_angle(lens: Lens, pinhole: Camera) -> float:
+    """Largest angle from the optical axis of the real camera to a point of the sensor's view, which is a corner (rad).
+
+    Args:
+        lens: The lens and the pose of the real camera.
+        pinhole: The simulated camera that defines the view, from `Sensor.camera`.
+    """
+    left, top, width, height = window(pinhole, _RESOLUTION)
+    corners = np.array([(x, y, 0.0) for x in (left, left + width) for y in (top, top + height)])
+    seen = corners @ lens.matrix.T + np.asarray(lens.translation)
+    return float(np.arctan2(np.hypot(seen[:, 0], seen[:, 1]), seen[:, 2]).max())
+
+
+def check_view(lens: Lens, pinhole: Camera, largest_angle: float | None = None) -> None:
+    """Check that the camera sees the whole view and that the calibration images cover the corners of the view.
+
+    Args:
+        lens: The lens and the pose of the real camera.
+        pinhole: The simulated camera that defines the view, from `Sensor.camera`.
+        largest_angle: `Calibration.largest_angle`, which the view may exceed by 3 degrees (rad). None: not checked.
+
+    Raises:
+        CalibrationError: A part of the view is not in the image, or beyond the corners of all calibration images.
+    """
+    needed = view_angle(lens, pinhole)
+    if largest_angle is not None and needed > largest_angle + _EXTRAPOLATION:
+        raise CalibrationError(
+            f"the corners of the sensor's view are up to {math.degrees(needed):.1f} degrees from the optical axis, but "
+            f"the calibration images show the board only up to {math.degrees(largest_angle):.1f} degrees: take more "
+            "images with the board in the corners of the image, and calibrate again"
+        )
+    try:
+        pixels = rectification(lens, pinhole, _RESOLUTION)
+    except ValueError as error:
+        raise CalibrationError(str(error)) from error
+    size = np.array([lens.width, lens.height])
+    outside = np.any((pixels < -0.5) | (pixels > size - 0.5), axis=-1)
+    if outside.any():
+        blocks = [b for rows in np.array_split(outside, 3) for b in np.array_split(rows, 3, axis=1)]
+        parts = ", ".join(part for part, block in zip(PARTS, blocks, strict=True) if block.any())
+        raise CalibrationError(
+            f"{outside.mean():.2%} of the sensor's view ({parts}) lies outside of the raw image: mount the camera "
+            "under the centre of the pad and parallel to it, or use a lens with a larger field of view"
+        )
+
+
+def covered(corners: Sequence[FoundCorners], size: tuple[int, int]) -> tuple[str, ...]:
+    """Return the parts of the raw image, such as "top left", in which any corner of the board was found.
+
+    Of the 3 x 3 parts, the outer rows and columns have 20 % of the image's height and width.
+
+    Args:
+        corners: Corners of the board in each image, from `find_board`.
+        size: Width and height of the raw images (pixels).
+    """
+    pixels = np.concatenate([np.zeros((0, 2)), *(found.pixels for found in corners)])
+    thirds = np.digitize((pixels + 0.5) / np.asarray(size), [_OUTER, 1 - _OUTER])
+    present = {f"{_ROWS[row]} {_COLUMNS[column]}" for column, row in thirds}
+    return tuple(part for part in PARTS if part in present)

@@ -17,7 +17,6 @@ import dataclasses
 import datetime
 import json
 import os
-import shutil
 import time
 import zlib
 from pathlib import Path
@@ -29,7 +28,7 @@ import cv2
 from sts_jax import storage
 from sts_jax.hardware import matroska
 from sts_jax.hardware.proof import Settling, Shot
-from sts_jax.hardware.sensor_file import Device, sensor_file
+from sts_jax.hardware.sensor_file import copy_sensor
 from sts_jax.hardware.session import Origin
 
 FORMAT = 1  # version of the format of a recording. Incremented when older files can no longer be read
@@ -100,7 +99,7 @@ class Recorder:
             raise FileExistsError(f"{self.folder} is not an empty folder: give the name of a new folder.")
         self.folder.mkdir(parents=True, exist_ok=True)
         if file is not None:
-            _copy_sensor(sensor_file(file), self.folder)
+            copy_sensor(file, self.folder)
         storage.write_json(
             self.folder / HEAD,
             {
@@ -198,12 +197,3 @@ class Recorder:
                 "recorded before is kept."
             ) from error
         return before + len(data)
-
-
-def _copy_sensor(file: Path, folder: Path) -> None:
-    """Copy a sensor file and its background images into a folder."""
-    device = Device.load(file)
-    for background in (device.background_visual, device.background_tactile):
-        if background is not None:
-            shutil.copyfile(file.with_name(background.name), folder / background.name)
-    shutil.copyfile(file, folder / "sensor.json")

@@ -28,11 +28,12 @@ import cv2
 import numpy as np
 from jaxtyping import Int, UInt8
 
-from sts_jax import storage
+from sts_jax import optics, storage
 from sts_jax.hardware import protocol
 from sts_jax.hardware.camera import CameraConfig, device_path, stable_path
 from sts_jax.hardware.guide import End
 from sts_jax.hardware.leds import Lit
+from sts_jax.hardware.lens import Lens, rectified
 from sts_jax.hardware.proof import Pair, Settling, Shot, Stream
 from sts_jax.hardware.sts import STS
 from sts_jax.storage import MANIFEST, DamagedFileError
@@ -575,3 +576,29 @@ class Session:
                 else:
                     self._changed.wait_for(lambda: self._closing, _RETRY_S)
                 self._changed.notify_all()
+
+
+def recorded_images(
+    recordings: Recordings,
+    lens: Lens,
+    pinhole: optics.Camera,
+    resolution: tuple[int, int] = (64, 64),
+    *,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> RecordedImages:
+    """Read and rectify the initial and final images of all confirmed trajectories, in the order of their numbers.
+
+    Args:
+        recordings: Confirmed trajectories, from `load_recordings`.
+        lens: Lens and pose of the real camera, from `Device.lens`.
+        pinhole: The simulated camera that defines the view, from `Sensor.camera`.
+        resolution: Height and width of the rectified images (pixels).
+        progress: Called after each trajectory, with the number of trajectories so far and of all.
+    """
+    width, height = recordings.origin.width, recordings.origin.height
+    if (width, height) != (lens.width, lens.height):
+        raise ValueError(
+            f"{recordings.folder} has images of {width}x{height} pixels, but the lens belongs to images of "
+            f"{lens.width}x{lens.height} pixels: use the sensor file of the device that took the images"
+        )
+    return recordings.images(lambda image: rectified(lens, pinhole, image, resolution), progress)

@@ -6,21 +6,22 @@ import math
 import cv2
 import numpy as np
 
-from sts_jax.hardware.lens import Lens, Pinhole, distortion
+from sts_jax.hardware.lens import Lens, distortion
 from sts_jax.hardware.twin.photometry import Warp
+from sts_jax.optics import Camera
 
 MOST_SAMPLES = 3  # largest default number of samples per raw pixel along each axis
 _OUTSIDE = -2.0  # coordinate of a raw pixel that lies outside the rendered view
 
 
-def lens_warp(lens: Lens, pinhole: Pinhole, resolution: tuple[int, int], *, samples: int | None = None) -> Warp:
+def lens_warp(lens: Lens, pinhole: Camera, resolution: tuple[int, int], *, samples: int | None = None) -> Warp:
     """Compute the mapping from a rendered image to the raw image of a fisheye lens.
 
     Raw pixels that correspond to no point of the rendered image are black.
 
     Args:
         lens: Fisheye camera whose raw image is wanted.
-        pinhole: Pinhole camera of the rendered view, such as `sts_jax.Sensor().camera`.
+        pinhole: Camera camera of the rendered view, such as `sts_jax.Sensor().camera`.
         resolution: (height, width) of the rendered image (pixels).
         samples: Number of samples along each axis of a raw pixel, >= 1. The value of the pixel is the mean of its
             samples. None: the number that avoids aliasing, but at most 3.
