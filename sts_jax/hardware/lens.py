@@ -175,7 +175,7 @@ def rectified(
             f"the image has {image.shape[1]}x{image.shape[0]} pixels, but the lens was calibrated with images of "
             f"{lens.width}x{lens.height} pixels: set the camera to this size, or calibrate the lens again"
         )
-    maps = _rectifying_maps(lens, _plain(pinhole), resolution)
+    maps = _rectifying_maps(lens, plain(pinhole), resolution)
     sampled = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
     return _averaged(sampled, resolution)
 
@@ -207,7 +207,7 @@ def distorted(
         outside: Grey value or RGB colour of the raw pixels outside of the view, 0 to 255.
         samples: Number of samples per raw pixel in each direction, >= 1. None: as many as avoid aliasing.
     """
-    maps = distorting_maps(lens, _plain(pinhole), image.shape[:2], samples)
+    maps = distorting_maps(lens, plain(pinhole), image.shape[:2], samples)
     colour = (outside,) * 4 if isinstance(outside, int | float) else outside
     sampled = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=colour)
     return _averaged(sampled, (lens.height, lens.width))
@@ -225,7 +225,7 @@ def window(pinhole: Camera, resolution: tuple[int, int]) -> tuple[float, float, 
     return -width / 2, -height / 2, width, height
 
 
-def _plain(pinhole: Camera) -> Camera:
+def plain(pinhole: Camera) -> Camera:
     """The camera with Python numbers, as a hashable key for the cached maps."""
     return Camera(*(float(getattr(pinhole, field.name)) for field in dataclasses.fields(Camera)))
 

@@ -1,22 +1,25 @@
-"""`Twin`: a simulated sensor, whose LED controller and camera share one clock."""
+"""`Twin`: a simulated sensor, whose LED controller and camera share one clock, and the log of its frames."""
 
+import contextlib
 import dataclasses
+import json
 import math
 import os
 import random
 import threading
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import UInt8
 
+from sts_jax import storage
 from sts_jax.hardware import protocol
 from sts_jax.hardware.emulation import EmulatedController
 from sts_jax.hardware.leds import Lit
-from sts_jax.hardware.twin import faults, photometry
-from sts_jax.hardware.twin.lights import LightHistory
-from sts_jax.hardware.twin.log import Exposure, Log
+from sts_jax.hardware.twin import photometry
 from sts_jax.hardware.twin.scene import Phase, Scene
 
 ANSWER_S = 0.004  # duration of a request on the virtual clock (s). Its levels apply after half of this time
@@ -24,8 +27,25 @@ _TICK_S = 0.005  # period with which the watchdog is checked on the virtual cloc
 
 
 @dataclasses.dataclass(frozen=True)
+class Exposure:
+    """The ground truth of one frame. Times are on the twin's clock, `time.monotonic` if the twin is served."""
+
+    index: int  # number of the frame, from 0
+    start_s: float  # begin of the exposure (s)
+    end_s: float  # end of the exposure (s)
+    due_s: float  # planned time of delivery (s). A busy machine delivers later
+    light: float  # mean brightness of the LEDs during the exposure, as a share of their full power
+    lowest: float  # smallest brightness during the exposure, as a share
+    highest: float  # largest brightness during the exposure, as a share
+    phase: str  # phase of the scene in the middle of the exposure: empty, held, moving or still
+    trajectory: int  # number of the current or last trajectory, or -1 before the first one
+    frame: int  # index of the rendered pose in the trajectory
+    pose: tuple[float, ...] | None  # object's position (m) and quaternion (w, x, y, z), or None without an object
+
+
+@dataclasses.dataclass(frozen=True)
 class State:
-    """The state of a `Twin` (a simulated sensor) at one time: its scene, its lights and its camera."""
+    """The scene, the lights and the camera at one time."""
 
     now_s: float  # time on the twin's clock (s)
     phase: str  # phase of the scene: empty, held, moving or still
@@ -38,14 +58,11 @@ class State:
     frames: int  # number of frames produced so far
 
 
-class Made(NamedTuple):
-    """One frame of a `Twin` (a simulated sensor): its ground truth and its JPEG image.
+class TwinFrame(NamedTuple):
+    """One frame of the camera."""
 
-    The ground truth contains the times of the exposure, the brightness of the LEDs, and the pose of the object.
-    """
-
-    exposure: Exposure  # ground truth of the frame
-    jpeg: bytes  # image of the frame, as a client receives it
+    exposure: Exposure  # ground truth
+    jpeg: bytes  # image, as a client receives it
 
 
 class Twin:
@@ -67,13 +84,11 @@ class Twin:
     # `_boot` sets these.
     _epoch_s: float  # begin of the camera's first exposure
     _controller: EmulatedController
-    _lights: LightHistory
+    _lights: photometry.LightHistory
     _sequence: int  # number of the last request of `set` and `ping`
     _index: int  # number of the last frame that `capture` returned
-    _made: int  # number of frames produced so far
-    _last: Made | None  # last frame that was produced
+    _frames: int  # number of frames produced so far
     _due_s: float  # time of delivery of the last frame
-    _stalled_until_s: float
     _phase: str | None  # phase at the last call of `operate`
     _next_s: float  # time of the next command of `operate`
 
@@ -96,41 +111,34 @@ class Twin:
             rate: Frame rate of the camera (frames/s).
             imperfections: Deviations of the camera and the lights from ideal ones. Default: `Imperfections()`.
             warp: Lens distortion, made by `lens_warp`. Default: no distortion.
-            seed: Seed of the image noise, of the random delays of the frames, and of the random times at which the twin
-                holds and releases the object.
-            release_every: Mean time for which the object is held plus mean time for which the object then rests (s).
-                The twin holds and releases the object at random times. Default: the object moves only when `command`
-                is called.
-            log: Path of a file that receives one JSON line with the fields of `Exposure` per frame. Default: no log.
-            record: Path of a motion JPEG file that receives all frames in the order of the log. Default: no file.
-
-        Raises:
-            ValueError: `rate` or `release_every` is not positive and finite, or the exposure is longer than the time
-                between two frames.
-            OSError: `log` or `record` cannot be written.
+            seed: Seed of the noise, of the random delays of the frames, and of `release_every`.
+            release_every: Mean time for which the object is held plus mean time for which it then rests (s). The twin
+                holds and releases it at random times. Default: the object moves only when `command` is called.
+            log: File that receives one JSON line with the fields of `Exposure` per frame.
+            record: Motion JPEG file that receives all frames in the order of the log.
         """
         self.imperfections = photometry.Imperfections() if imperfections is None else imperfections
-        if not 0 < rate < math.inf:
-            raise ValueError(f"rate must be positive and finite, got {rate}")
-        if self.imperfections.exposure_s > 1 / rate:
+        if not 0 < rate <= 1 / self.imperfections.exposure_s:
             raise ValueError(
-                f"imperfections.exposure_s is {self.imperfections.exposure_s} s, but at {rate:g} frames/s it must be "
-                f"at most {1 / rate:.4f} s: give a smaller rate or exposure_s"
+                f"rate is {rate:g} frames/s, but must be > 0 and at most 1 / imperfections.exposure_s = "
+                f"{1 / self.imperfections.exposure_s:g}: give a smaller rate or exposure_s"
             )
         if release_every is not None and not 0 < release_every < math.inf:
             raise ValueError(f"release_every must be None or a positive and finite time (s), got {release_every}")
         self.scene = scene
         self.rate = rate
+        self.serial_number = f"TWIN{seed}"  # of the LED controller
         self.blender = photometry.Blender(self.imperfections, exposure=scene.exposure, warp=warp, seed=seed)
         self._release_every = release_every
         self._random = random.Random(seed)
-        self._serial_number = f"TWIN{seed}"
-        self._lock = threading.Lock()  # protects the controller, the lights, the scene's commands and the faults
+        self._lock = threading.Lock()  # protects the controller, the lights and the scene's commands
         self._commands = threading.Lock()  # lets one command run at a time
-        self._waiting = faults.Queue()
-        self._log = Log(log, record)
         self._clock: Callable[[], float] | None = None
         self._virtual_s = 0.0
+        with contextlib.ExitStack() as files:
+            self._lines = None if log is None else files.enter_context(Path(log).open("w", buffering=1))
+            self._jpegs = None if record is None else files.enter_context(Path(record).open("wb", buffering=0))
+            self._files = files.pop_all()  # keeps the files open after this block, because both could be opened
         self._boot(0.0)
 
     @property
@@ -139,51 +147,21 @@ class Twin:
         return self._virtual_s if self._clock is None else self._clock()
 
     @property
-    def serial_number(self) -> str:
-        """Serial number of the LED controller: `TWIN` followed by the seed of the twin, such as `TWIN0`."""
-        return self._serial_number
-
-    @property
     def state(self) -> State:
         """The current state of the scene, the lights and the camera."""
         with self._lock:
-            now = self.now_s
-            seen, leds = self.scene.at(now), self._controller
-            return State(
-                now,
-                seen.phase,
-                seen.trajectory,
-                seen.frame,
-                seen.pose,
-                leds.levels,
-                leds.counter,
-                leds.boot,
-                self._made,
-            )
+            now, leds = self.now_s, self._controller
+            return State(now, *self.scene.at(now), leds.levels, leds.counter, leds.boot, self._frames)
 
     def run_on(self, clock: Callable[[], float]) -> None:
-        """Replace the virtual clock by the given clock, and reset the LED controller, the lights and the camera.
-
-        Args:
-            clock: Function that returns the time of the new clock (s), such as `time.monotonic`.
-
-        Raises:
-            RuntimeError: The virtual clock has advanced already, so times of both clocks would be mixed.
-        """
+        """Replace the virtual clock, which must not have advanced, by a function such as `time.monotonic`."""
         if self._virtual_s:
-            raise RuntimeError(
-                f"the virtual clock of this Twin is at {self._virtual_s} s, but Served needs a Twin whose virtual "
-                "clock is at 0 s, because Served replaces this clock: make a new Twin, and pass the new Twin to Served "
-                "before any call of `Twin.step`, `Twin.capture`, `Twin.set` or `Twin.ping`"
-            )
+            raise RuntimeError(f"the virtual clock of this Twin is at {self._virtual_s} s already: make a new Twin")
         self._clock = clock
         self._boot(clock())
 
     def command(self, command: str) -> State:
-        """Move the object in the scene.
-
-        On the real clock, this method first renders the images that the command needs, which may take seconds. On the
-        virtual clock, `capture` renders each pose the first time that the pose is needed.
+        """Move the object in the scene. On the real clock, the images that are needed are rendered first.
 
         Args:
             command: `hold` holds the object on the pad in the first pose of the next trajectory, `release` lets it go,
@@ -191,10 +169,6 @@ class Twin:
 
         Returns:
             The state after the command.
-
-        Raises:
-            ValueError: The command is unknown, the scene is constant (such as a `Picture`), `release` is given while no
-                object is held, or the object does not come to rest in any of 32 simulated trajectories in a row.
         """
         with self._commands:
             if self._clock is not None:
@@ -204,12 +178,7 @@ class Twin:
         return self.state
 
     def operate(self) -> None:
-        """Hold or release the object when a randomly chosen time is reached.
-
-        The argument `release_every` of `Twin` is the mean time for which an object is held plus the mean time for which
-        it then rests (s). If this argument is None, this method does nothing. `step` and `Served` call this method
-        regularly.
-        """
+        """Hold or release the object when a random time of `release_every` is reached. Call this regularly."""
         if self._release_every is None:
             return
         now, phase = self.now_s, self.state.phase
@@ -219,198 +188,76 @@ class Twin:
         if now >= self._next_s and phase != Phase.MOVING:
             self.command("release" if phase == Phase.HELD else "hold")
 
-    def receive(self, data: bytes) -> bytes:
-        """Pass bytes from the host to the LED controller, and return the bytes that the controller sends back."""
+    def receive(self, data: bytes = b"") -> bytes:
+        """Pass bytes from the host to the LED controller and run its watchdog. Returns the bytes that it sends back."""
         with self._lock:
             now = self.now_s
             sent = self._controller.receive(data, now)
             self._lights.set(now, self._controller.levels)
         return sent
 
-    def tick(self) -> bytes:
-        """Run the LED controller's watchdog, and return the bytes that the controller sends.
-
-        The watchdog turns the lights off if no request has arrived within its period, 1 s by default.
-        """
-        return self.receive(b"")
-
-    def inject(self, fault: faults.Fault) -> None:
-        """Simulate a fault of the camera or a restart of the LED controller.
-
-        Args:
-            fault: Fault of the kind `stall`, `repeat`, `black`, `resize` or `reboot`. `Fault` describes the kinds.
-
-        Raises:
-            ValueError: The fault is of another kind. The other kinds concern a connection, and a twin has connections
-                only while `Served` runs it. Pass these faults to `Served.inject`.
-        """
-        if fault.kind == "reboot":
-            with self._lock:
-                now = self.now_s
-                boot = (self._controller.boot + 1) % 65536
-                self._controller = EmulatedController(now_s=now, boot=boot, serial_number=self._serial_number)
-                self._lights.set(now, self._controller.levels)
-        elif fault.kind == "stall":
-            with self._lock:
-                self._stalled_until_s = self.now_s + fault.seconds
-        elif fault.kind in faults.IMAGE_KINDS:
-            with self._lock:
-                self._waiting.add(fault)
-        else:
-            raise ValueError(
-                f"fault has the kind {fault.kind!r}, which concerns a connection, but Twin.inject accepts only "
-                f"the kinds {', '.join(faults.DEVICE_KINDS)}: pass the twin to Served, and call Served.inject"
-            )
-
     def end_s(self, index: int) -> float:
-        """Return the time on the twin's clock at which the exposure of a frame ends (s). Frames are counted from 0."""
+        """Time on the twin's clock at which the exposure of a frame ends (s). Frames are counted from 0."""
         return self._epoch_s + self.imperfections.exposure_s + index / self.rate
 
-    def next_index(self, after: int, now_s: float) -> int:
-        """Return the number of the first frame that is delivered at a given time or later.
-
-        Frames up to the number `after` are skipped. The random part of the delay (`Imperfections.jitter_s`) is ignored.
+    def make(self, index: int) -> TwinFrame:
+        """Produce a frame after the end of its exposure, and write it to the files `log` and `record`.
 
         Args:
-            after: Number of the last frame to skip, or -1 to skip none.
-            now_s: Earliest time of delivery on the twin's clock (s).
-
-        Returns:
-            A number greater than `after`.
-        """
-        elapsed = now_s - self.imperfections.lag_s - self.end_s(0)
-        return max(after + 1, math.ceil(elapsed * self.rate - 1e-6))
-
-    def make(self, index: int) -> Made | None:
-        """Produce a frame, and write it to the files `log` and `record` of the twin.
-
-        Call this method at the time `end_s(index)` or later, when the exposure of the frame has ended, and always from
-        the same thread.
-
-        Args:
-            index: Number of the frame, from 0. It must increase from call to call.
-
-        Returns:
-            The frame, or None while the fault `stall` stops the camera.
+            index: Number of the frame, which must increase from call to call, in one thread.
         """
         constants = self.imperfections
         end = self.end_s(index)
         start = end - constants.exposure_s
         with self._lock:
-            if self.now_s < self._stalled_until_s:
-                return None
             light = self._lights.over(start, end)
             self._lights.forget(start)
             seen = self.scene.at((start + end) / 2)
-            fault = self._waiting.take(*faults.IMAGE_KINDS)
-            self._made += 1
+            self._frames += 1
         self._due_s = max(self._due_s, end + constants.lag_s + self._random.uniform(0, constants.jitter_s))
-        kind = None if fault is None or (fault.kind == "repeat" and self._last is None) else fault.kind
-        if kind == "repeat" and self._last is not None:
-            exposure = dataclasses.replace(self._last.exposure, index=index, due_s=self._due_s, fault=kind)
-            made = Made(exposure, self._last.jpeg)
-        else:
-            exposure = Exposure(
-                index,
-                start,
-                end,
-                self._due_s,
-                light.mean,
-                light.lowest,
-                light.highest,
-                seen.phase,
-                seen.trajectory,
-                seen.frame,
-                seen.pose,
-                kind,
-            )
-            image = self.blender.frame(self.scene.ends(seen, self.blender), light.mean)
-            if kind == "black":
-                image = np.zeros_like(image)
-            elif kind == "resize":
-                image = np.ascontiguousarray(image[::2, ::2])
-            made = Made(exposure, photometry.encode(image, constants.jpeg_quality))
-        self._last = made
-        self._log.write(*made)
-        return made
+        exposure = Exposure(index, start, end, self._due_s, *light, *seen)
+        image = self.blender.frame(self.scene.ends(seen, self.blender), light.mean)
+        jpeg = photometry.encode(image, constants.jpeg_quality)
+        if self._jpegs is not None:
+            self._jpegs.write(jpeg)
+        if self._lines is not None:
+            self._lines.write(json.dumps(dataclasses.asdict(exposure)) + "\n")
+        return TwinFrame(exposure, jpeg)
 
     def step(self, seconds: float) -> None:
-        """Advance the virtual clock.
-
-        Meanwhile, the LED controller turns the lights off if no request arrives for 1 s. If the argument
-        `release_every` of `Twin` was given, the object is held and released at random times.
-
-        Args:
-            seconds: Time by which the clock advances, >= 0 (s).
-
-        Raises:
-            ValueError: `seconds` is negative or not finite.
-            RuntimeError: The twin runs on the real clock.
-        """
+        """Advance the virtual clock, with the controller's watchdog and the movements of `release_every`."""
         if self._clock is not None:
-            raise RuntimeError(
-                "`step`, `capture`, `set` and `ping` need a Twin that runs on its virtual clock, but this Twin runs on "
-                "the real clock: read its images through hardware.STS, or make a new Twin, because a new Twin runs on "
-                "a virtual clock"
-            )
+            raise RuntimeError("this Twin runs on the real clock: read it through hardware.STS, or make a new Twin")
         if not 0 <= seconds < math.inf:
             raise ValueError(f"seconds must be >= 0 and finite, got {seconds}")
         target = self._virtual_s + seconds
         while self._virtual_s < target:
             self._virtual_s = min(self._virtual_s + _TICK_S, target)
-            self.tick()
+            self.receive()
             self.operate()
 
-    def capture(self) -> tuple[Exposure, np.ndarray]:
-        """Advance the virtual clock until the next frame is delivered, and return this frame.
-
-        Returns:
-            The ground truth of the frame, and its image as uint8 RGB of shape (height, width, 3), decoded from its
-            JPEG.
-
-        Raises:
-            RuntimeError: The twin runs on the real clock.
-        """
-        while True:
-            self._index = self.next_index(self._index, self.now_s)
-            self.step(max(0.0, self.end_s(self._index) + self.imperfections.lag_s - self.now_s))
-            if (made := self.make(self._index)) is not None:
-                self.step(max(0.0, made.exposure.due_s - self.now_s))
-                return made.exposure, photometry.decode(made.jpeg)
+    def capture(self) -> tuple[Exposure, UInt8[np.ndarray, "height width 3"]]:
+        """Advance the virtual clock until the next frame is delivered. Returns its ground truth and its RGB image."""
+        elapsed = self.now_s - self.imperfections.lag_s - self.end_s(0)
+        self._index = max(self._index + 1, math.ceil(elapsed * self.rate - 1e-6))
+        self.step(max(0.0, self.end_s(self._index) + self.imperfections.lag_s - self.now_s))
+        exposure, jpeg = self.make(self._index)
+        self.step(max(0.0, exposure.due_s - self.now_s))
+        return exposure, photometry.decode(jpeg)
 
     def set(self, levels: Sequence[int]) -> Lit:
-        """Set the lights, and advance the virtual clock by 4 ms (`ANSWER_S`), the duration of a request.
-
-        Args:
-            levels: Duty cycles of the four LED channels, 0 (off) to 255 (always on).
-
-        Returns:
-            The controller's answer with the applied levels. Its times are on the virtual clock.
-
-        Raises:
-            ValueError: There are not four levels, or one is out of range.
-            RuntimeError: The twin runs on the real clock.
-        """
+        """Set the four levels (0 to 255), and advance the virtual clock by `ANSWER_S`. Returns the applied levels."""
         first, second, third, fourth = levels
         return self._request(protocol.Set(self._next_sequence(), (first, second, third, fourth)))
 
     def ping(self) -> Lit:
-        """Ask the LED controller for the levels of its LEDs, and advance the virtual clock by 4 ms (`ANSWER_S`).
-
-        The controller turns the lights off after 1 s without a request. Regular calls of this method keep them on.
-
-        Returns:
-            The controller's answer with the current levels. Its times are on the virtual clock.
-
-        Raises:
-            RuntimeError: The twin runs on the real clock.
-        """
+        """Ask for the levels, which keeps the lights on for another 1 s, and advance the clock by `ANSWER_S`."""
         return self._request(protocol.Ping(self._next_sequence()))
 
     def close(self) -> None:
         """Stop the scene's rendering thread, and close the files of the log. Closing twice is allowed."""
         self.scene.close()
-        self._log.close()
+        self._files.close()
 
     def __enter__(self) -> "Twin":
         return self
@@ -423,13 +270,12 @@ class Twin:
     def _boot(self, now_s: float) -> None:
         """Reset the controller, the lights and the camera at a time (s)."""
         self._epoch_s = now_s
-        self._controller = EmulatedController(now_s=now_s, serial_number=self._serial_number)
-        self._lights = LightHistory(self.imperfections.rise_s)
+        self._controller = EmulatedController(now_s=now_s, serial_number=self.serial_number)
+        self._lights = photometry.LightHistory(self.imperfections.rise_s)
         self._sequence = 0
         self._index = -1
-        self._made = 0
-        self._last = None
-        self._due_s = self._stalled_until_s = -math.inf
+        self._frames = 0
+        self._due_s = -math.inf
         self._phase = None
         self._next_s = math.inf
 
@@ -443,7 +289,12 @@ class Twin:
         self.step(ANSWER_S / 2)
         lines = self.receive(protocol.encode_request(request)).splitlines(keepends=True)
         self.step(ANSWER_S / 2)
-        for reply in map(protocol.decode_reply, lines):
-            if isinstance(reply, protocol.State):
-                return Lit(reply.levels, reply.counter, reply.boot, sent_s, self.now_s)
-        raise AssertionError(f"the emulated LED controller must answer a request with a State reply, got {lines!r}")
+        reply = next(reply for reply in map(protocol.decode_reply, lines) if isinstance(reply, protocol.State))
+        return Lit(reply.levels, reply.counter, reply.boot, sent_s, self.now_s)
+
+
+def read_log(path: str | os.PathLike) -> list[Exposure]:
+    """Read the log file of a `Twin`, which may still be writing it: an incomplete last line is ignored."""
+    text = Path(path).read_text()
+    lines = text[: text.rfind("\n") + 1].splitlines()
+    return [storage.decode(Exposure, json.loads(line), "frame") for line in lines]

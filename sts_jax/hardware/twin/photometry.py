@@ -1,27 +1,104 @@
-"""Blends two images of a scene, LEDs off and LEDs on, into a camera frame with vignetting, noise and JPEG encoding."""
+"""Brightness of the LEDs over time, and camera frames: blends of two images with vignetting, noise and JPEG."""
 
+import bisect
 import dataclasses
 import math
+import sys
 from typing import NamedTuple
 
 import cv2
 import numpy as np
+from jaxtyping import Float, UInt8, UInt16
 
+from sts_jax._checked import checked
+from sts_jax.hardware import protocol
+from sts_jax.hardware.lens import Lens, distorting_maps, plain
+from sts_jax.optics import Camera, to_linear, to_srgb
+
+_RISEN = 30.0  # time constants after which the target counts as reached, because exp(-30) is 1e-13
 _FULL = 65535  # uint16 value of full-scale linear light
 # Drawing noise for every frame is too slow, so one array of random numbers serves all frames. The array is longer than
 # a frame by this number, and each frame starts at another position in it.
 _SPARE = 1 << 20
-_LONGEST = 65500  # pixels, longest side of an image that OpenCV's JPEG encoder accepts
-_JPEG = b"\xff\xd8\xff"  # first bytes of a JPEG image
 _STRIP = 1 << 18  # number of values that are processed at once, so that they stay in the processor's cache
+_MOST_SAMPLES = 3  # largest number of samples per raw pixel along each axis, unless it is given
+
+
+class Light(NamedTuple):
+    """The brightness of the LEDs during an interval, as a share of their full power, 0 to 1."""
+
+    mean: float  # mean share
+    lowest: float  # smallest share
+    highest: float  # largest share
+
+
+class _Change(NamedTuple):
+    """A change of the levels. From here to the next change, the brightness goes from `share` to `target`."""
+
+    time_s: float  # time of the change (s)
+    share: float  # share of the full power at this time
+    target: float  # share of the full power of the new levels
+
+
+class LightHistory:
+    """The brightness of the LEDs over time, as a share of their full power. Not thread-safe.
+
+    After a change of the levels at t0, the share approaches the mean of the four levels, a:
+
+        s(t) = a + (s0 - a) exp(-(t - t0) / tau)
+
+    The LEDs are dimmed by pulses at 31 kHz, far shorter than an exposure, so only the mean of the pulses matters.
+    """
+
+    def __init__(self, rise_s: float = 0.0):
+        """Start with the lights off.
+
+        Args:
+            rise_s: Time constant tau, >= 0 (s). At 0, the brightness follows the levels at once.
+        """
+        self._rise_s = rise_s
+        self._changes = [_Change(-math.inf, 0.0, 0.0)]
+
+    def set(self, time_s: float, levels: protocol.Levels) -> None:
+        """Record a change of the LED levels (0 to 255) at a time (s) that is not before the last change."""
+        last, target = self._changes[-1], sum(levels) / (255 * len(levels))
+        if time_s < last.time_s:
+            raise ValueError(f"time_s must be at least {last.time_s} s, the time of the last change, got {time_s} s")
+        if target != last.target:
+            self._changes.append(_Change(time_s, self._share(last, time_s), target))
+
+    def over(self, start_s: float, end_s: float) -> Light:
+        """Return the exact mean, the smallest and the largest brightness between two times (s)."""
+        first = bisect.bisect_right(self._changes, start_s, key=lambda change: change.time_s) - 1
+        integral, shares = 0.0, []
+        for i in range(first, len(self._changes)):
+            change = self._changes[i]
+            begin = max(start_s, change.time_s)
+            end = min(end_s, self._changes[i + 1].time_s) if i + 1 < len(self._changes) else end_s
+            if begin >= end:
+                break
+            low, high = self._share(change, begin), self._share(change, end)
+            # The integral of (s0 - a) exp(-(t - t0) / tau) over the interval is tau times its decrease.
+            integral += change.target * (end - begin) + self._rise_s * (low - high)
+            shares += [low, high]
+        lowest, highest = min(shares), max(shares)
+        return Light(min(max(integral / (end_s - start_s), lowest), highest), lowest, highest)
+
+    def forget(self, before_s: float) -> None:
+        """Delete the changes that `over` does not need for intervals from `before_s` (s) on."""
+        keep = bisect.bisect_right(self._changes, before_s, key=lambda change: change.time_s) - 1
+        del self._changes[:keep]
+
+    def _share(self, change: _Change, time_s: float) -> float:
+        """The share of the full power at a time after a change and before the next one."""
+        if change.share == change.target or time_s - change.time_s >= _RISEN * self._rise_s:
+            return change.target
+        return change.target + (change.share - change.target) * math.exp((change.time_s - time_s) / self._rise_s)
 
 
 @dataclasses.dataclass(frozen=True)
 class Imperfections:
-    """Deviations of a simulated camera and simulated lights from ideal ones, such as noise and delays.
-
-    The default values are assumed, not measured.
-    """
+    """Deviations of a simulated camera and simulated lights from ideal ones. The defaults are assumed, not measured."""
 
     exposure_s: float = 0.012  # time during which the camera integrates the light of one frame (s)
     # time from the end of the exposure to the delivery of the frame (s). We assume 0.015 to 0.12 s for real cameras
@@ -39,33 +116,19 @@ class Imperfections:
     jpeg_quality: int = 92  # quality of OpenCV's JPEG encoder, 1 to 100
 
     def __post_init__(self) -> None:
-        """Check the fields.
-
-        Raises:
-            ValueError: A field is out of range. The message names it.
-        """
-        for name in ("exposure_s", "full_well"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be positive and finite, got {getattr(self, name)}")
-        for name in ("lag_s", "jitter_s", "rise_s", "read_noise"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be >= 0 and finite, got {getattr(self, name)}")
-        for name in ("leakage", "vignetting"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} must be a share from 0 to 1, got {getattr(self, name)}")
-        if self.jpeg_quality not in range(1, 101):
-            raise ValueError(f"jpeg_quality must be a whole number from 1 to 100, got {self.jpeg_quality}")
+        most = {"leakage": 1.0, "vignetting": 1.0, "jpeg_quality": 100}
+        for name, value in dataclasses.asdict(self).items():
+            if not 0 <= value <= most.get(name, sys.float_info.max):
+                raise ValueError(f"{name} must be finite and in [0, {most.get(name, math.inf)}], got {value}")
+        if 0 in (self.exposure_s, self.full_well, self.jpeg_quality):
+            raise ValueError(f"exposure_s, full_well and jpeg_quality must be > 0, got {self}")
 
 
 class Ends(NamedTuple):
-    """Two images of a scene: with the LEDs off, and with the LEDs at full power.
+    """The images of a scene with the LEDs off and at full power, in linear light with 65535 as full scale."""
 
-    The two images are in linear light, uint16 of shape (height, width, 3), where 65535 is full scale. `Blender.blend`
-    mixes the two images to an image at any brightness of the LEDs.
-    """
-
-    visual: np.ndarray  # image with the LEDs off
-    tactile: np.ndarray  # image with the LEDs at full power
+    visual: UInt16[np.ndarray, "height width 3"]  # image with the LEDs off
+    tactile: UInt16[np.ndarray, "height width 3"]  # image with the LEDs at full power
 
 
 class Warp(NamedTuple):
@@ -75,42 +138,40 @@ class Warp(NamedTuple):
     size: tuple[int, int]  # (height, width) of the raw image (pixels)
 
     def apply(self, image: np.ndarray) -> np.ndarray:
-        """Convert a rendered image to the raw image.
-
-        Args:
-            image: Rendered image in linear light, shape (height, width, 3).
-
-        Returns:
-            Raw image of the same data type as `image`, shape (h, w, 3), where (h, w) is the field `size`. Raw
-            pixels that show no part of `image` are 0.
-        """
+        """Convert a rendered image to the raw image. Raw pixels that show no part of it are 0."""
         sampled = cv2.remap(image, *self.maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
         return cv2.resize(sampled, self.size[::-1], interpolation=cv2.INTER_AREA)
 
 
-class Blender:
-    """Makes camera frames from two images of a scene: one with the LEDs off, and one with the LEDs at full power.
+def lens_warp(lens: Lens, pinhole: Camera, resolution: tuple[int, int], *, samples: int | None = None) -> Warp:
+    """Compute the mapping from a rendered image to the raw image of a fisheye lens.
 
-    First, call `ends` with both images. This takes as long as making a few frames, so do it only once for each pose of
-    the object. Then call `frame` for each frame. Only one thread at a time may call `frame`.
+    Args:
+        lens: Fisheye camera whose raw image is wanted.
+        pinhole: Pinhole camera of the rendered view, such as `sts_jax.Sensor().camera`.
+        resolution: (height, width) of the rendered image (pixels).
+        samples: Number of samples along each axis of a raw pixel, which are averaged. None: the number that avoids
+            aliasing, but at most 3.
+    """
+    maps = distorting_maps(lens, plain(pinhole), resolution, samples, _MOST_SAMPLES)
+    return Warp(maps, (lens.height, lens.width))
+
+
+class Blender:
+    """Makes camera frames from the images of a scene with the LEDs off and at full power.
+
+    `ends` converts both images once for each pose of the object. `frame` then makes frames, in one thread at a time.
     """
 
     def __init__(self, imperfections: Imperfections, *, exposure: float = 1.0, warp: Warp | None = None, seed: int = 0):
         """Prepare the lookup tables.
 
         Args:
-            imperfections: Deviations of the camera. `Blender` uses `leakage`, `vignetting`, `read_noise` and
-                `full_well`.
-            exposure: Exposure of the visual stream divided by the exposure of the tactile stream, > 0. The field
-                `room.exposure` of a `Sensor` contains this ratio.
-            warp: Lens distortion. Default: none.
+            imperfections: Deviations of the camera.
+            exposure: Exposure of the visual stream divided by that of the tactile stream (`Sensor.room.exposure`).
+            warp: Lens distortion. None: none.
             seed: Seed of the noise.
-
-        Raises:
-            ValueError: `exposure` is not positive and finite.
         """
-        if not 0 < exposure < math.inf:
-            raise ValueError(f"exposure must be positive and finite, got {exposure}")
         self._imperfections = imperfections
         self._exposure = exposure
         self._warp = warp
@@ -120,57 +181,30 @@ class Blender:
         # _SPARE is a power of 2. An odd step therefore visits all start positions before it repeats one.
         self._step = 2 * int(self._rng.integers(_SPARE // 2)) + 1
         values = np.arange(_FULL + 1) / _FULL
-        self._to_linear = np.round(_FULL * _linear(values)).astype(np.uint16)
-        self._to_srgb = np.round(255 * _srgb(values)).astype(np.uint8)
+        self._to_linear = np.round(_FULL * np.asarray(to_linear(values), np.float64)).astype(np.uint16)
+        self._to_srgb = np.round(255 * np.asarray(to_srgb(values), np.float64)).astype(np.uint8)
         variance = imperfections.read_noise**2 + values / imperfections.full_well
         self._deviation = (_FULL * np.sqrt(variance)).astype(np.float32)
 
-    def ends(self, visual: np.ndarray, tactile: np.ndarray) -> Ends:
-        """Convert both images of a scene to linear light, and apply the lens distortion and the vignetting.
+    @checked
+    def ends(self, visual: Float[np.ndarray, "height width 3"], tactile: Float[np.ndarray, "height width 3"]) -> Ends:
+        """Convert the sRGB images of a scene to linear light, with lens distortion and vignetting.
 
         Args:
-            visual: Image with the LEDs off (`Frame.visual`), sRGB in [0, 1], shape (height, width, 3).
-            tactile: Image with the LEDs at full power (`Frame.tactile`), of the same form.
-
-        Returns:
-            The pair of converted images, which is an argument of `blend` and of `frame`.
-
-        Raises:
-            ValueError: The shape of an image is not (height, width, 3).
+            visual: Image with the LEDs off (`Frame.visual`), in [0, 1].
+            tactile: Image with the LEDs at full power (`Frame.tactile`), in [0, 1].
         """
         return Ends(self._end(visual), self._end(tactile))
 
-    def blend(self, ends: Ends, light: float) -> np.ndarray:
-        """Make a camera frame without noise, as a mixture of an image with LEDs off and an image with LEDs on.
+    def blend(self, ends: Ends, light: float) -> UInt8[np.ndarray, "height width 3"]:
+        """Make a frame without noise at a mean brightness of the LEDs, 0 to 1.
 
-        If `Imperfections.leakage` and `Imperfections.vignetting` are 0 and there is no lens distortion, the frame
-        equals the image of `sts_jax.expose` up to rounding.
-
-        Args:
-            ends: Images of the scene, as `Blender.ends` returns them.
-            light: Mean brightness of the LEDs during the exposure, as a share of their full power, 0 to 1.
-
-        Returns:
-            Frame, uint8 RGB of shape (height, width, 3).
-
-        Raises:
-            ValueError: `light` is out of range.
+        Without leakage, vignetting and distortion, it equals the image of `sts_jax.expose` up to rounding.
         """
         return self._to_srgb[self._mixed(ends, light)]
 
-    def frame(self, ends: Ends, light: float) -> np.ndarray:
-        """Make a camera frame with noise, as a mixture of an image with LEDs off and an image with LEDs on.
-
-        Args:
-            ends: Images of the scene, as `Blender.ends` returns them.
-            light: Mean brightness of the LEDs during the exposure, as a share of their full power, 0 to 1.
-
-        Returns:
-            Frame, uint8 RGB of shape (height, width, 3).
-
-        Raises:
-            ValueError: `light` is out of range.
-        """
+    def frame(self, ends: Ends, light: float) -> UInt8[np.ndarray, "height width 3"]:
+        """Make a frame with noise at a mean brightness of the LEDs, 0 to 1."""
         linear = self._mixed(ends, light).reshape(-1)
         if len(self._noise) < linear.size:
             self._noise = self._rng.standard_normal(linear.size + _SPARE, np.float32)
@@ -188,8 +222,6 @@ class Blender:
 
     def _mixed(self, ends: Ends, light: float) -> np.ndarray:
         """Blend both images by the equation of `sts_jax.expose`, in linear light, uint16."""
-        if not 0 <= light <= 1:
-            raise ValueError(f"light must be a share of the LEDs' full power from 0 to 1, got {light}")
         light = self._imperfections.leakage + (1 - self._imperfections.leakage) * light
         bright = light * self._exposure
         share = bright / (1 - light + bright)
@@ -197,9 +229,6 @@ class Blender:
 
     def _end(self, image: np.ndarray) -> np.ndarray:
         """Convert one sRGB image to linear light, uint16, and apply the lens distortion and the vignetting."""
-        image = np.asarray(image)
-        if image.ndim != 3 or image.shape[2] != 3:
-            raise ValueError(f"visual and tactile must have shape (height, width, 3), but one has shape {image.shape}")
         linear = self._to_linear[np.round(np.clip(image, 0, 1) * _FULL).astype(np.uint16)]
         if self._warp is not None:
             linear = self._warp.apply(linear)
@@ -212,43 +241,15 @@ class Blender:
         return np.ascontiguousarray(linear)
 
 
-def encode(image: np.ndarray, quality: int) -> bytes:
-    """Encode an image as JPEG, and return the bytes of the file.
-
-    Args:
-        image: Image, uint8 RGB of shape (height, width, 3).
-        quality: Quality of OpenCV's encoder, 1 to 100.
-
-    Raises:
-        ValueError: The image has another type or shape, no pixels, or a side of more than 65500 pixels.
-    """
-    fits = image.dtype == np.uint8 and image.ndim == 3 and image.shape[2] == 3
-    if not fits or not all(1 <= side <= _LONGEST for side in image.shape[:2]):
-        raise ValueError(
-            f"image must be uint8 of shape (height, width, 3), with a height and a width from 1 to {_LONGEST} pixels, "
-            f"got {image.dtype} of shape {image.shape}"
-        )
+def encode(image: UInt8[np.ndarray, "height width 3"], quality: int) -> bytes:
+    """Encode an RGB image as a JPEG file with OpenCV's quality, 1 to 100."""
     _, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
     return data.tobytes()
 
 
-def decode(data: bytes) -> np.ndarray:
-    """Decode a JPEG image, and return it as uint8 RGB of shape (height, width, 3).
-
-    Raises:
-        ValueError: The bytes are not a JPEG image.
-    """
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data.startswith(_JPEG) else None
+def decode(data: bytes) -> UInt8[np.ndarray, "height width 3"]:
+    """Decode a JPEG file to an RGB image."""
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
     if image is None:
         raise ValueError(f"data must be a JPEG image, but its {len(data)} bytes cannot be decoded")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-
-
-def _linear(srgb: np.ndarray) -> np.ndarray:
-    """Convert sRGB values in [0, 1] to linear light (IEC 61966-2-1)."""
-    return np.where(srgb > 0.04045, ((srgb + 0.055) / 1.055) ** 2.4, srgb / 12.92)
-
-
-def _srgb(linear: np.ndarray) -> np.ndarray:
-    """Convert linear light in [0, 1] to sRGB values (IEC 61966-2-1)."""
-    return np.where(linear > 0.0031308, 1.055 * linear ** (1 / 2.4) - 0.055, 12.92 * linear)

@@ -1,4 +1,4 @@
-"""The scene of a `Twin` (a simulated sensor): an empty pad, or an object that is held, moving or at rest."""
+"""The scene in front of the twin's camera: an empty pad, or an object that is held, moving or at rest."""
 
 import abc
 import bisect
@@ -28,7 +28,7 @@ _NOWHERE = np.array([0, 0, -1, 1, 0, 0, 0], np.float32)  # pose of an object tha
 
 
 class Phase(enum.StrEnum):
-    """The phase of a scene: no object is there, or the object is held on the pad, moves, or lies still."""
+    """What the object does."""
 
     EMPTY = "empty"  # no object is on the pad
     HELD = "held"  # a hand, which is not rendered, holds the object on the pad in an unstable pose
@@ -37,112 +37,59 @@ class Phase(enum.StrEnum):
 
 
 class Seen(NamedTuple):
-    """The state of a scene at one time: its phase (empty, held, moving or still), and the pose of the object."""
+    """The state of a scene at one time."""
 
-    phase: Phase  # phase of the scene
+    phase: Phase
     trajectory: int  # number of the current trajectory, from 0. In an empty scene, number of the last one, or -1
     frame: int  # index of the rendered pose in the trajectory
     pose: tuple[float, ...] | None  # object's position (m) and quaternion (w, x, y, z), or None without an object
 
 
 class Scene(abc.ABC):
-    """Base class of the scenes in front of the camera of a `Twin` (a simulated sensor).
+    """Base class of scenes. A subclass defines `at` and `ends`, and `command` if its scene takes commands.
 
-    A subclass defines two methods. `at` returns the state of the scene at a given time. `ends` returns two images of
-    the scene in a given state: one with the LEDs off, and one with the LEDs at full power. A scene that takes commands
-    also defines `command`. The other methods are optional. `Twin` never calls `at` and `command` at the same time.
+    `Twin` never calls `at` and `command` at the same time. The commands are `hold`, `release` and `clear`.
     """
 
     exposure: float = 1.0  # exposure of the visual stream divided by that of the tactile stream (`Room.exposure`)
 
     @abc.abstractmethod
     def at(self, time_s: float) -> Seen:
-        """Return the state of the scene at a time.
-
-        Args:
-            time_s: Time on the twin's clock (s). The twin computes each frame only after the exposure of this frame, so
-                `time_s` is in the past. A few commands may have changed the scene since `time_s`. The returned state
-                must not include these changes.
-        """
+        """Return the state at a time (s), which may lie a few commands before the newest one."""
 
     @abc.abstractmethod
     def ends(self, seen: Seen, blender: Blender) -> Ends:
-        """Return two images of the scene: one with the LEDs off, and one with the LEDs at full power.
-
-        The images show the scene in the state `seen`. Images that were rendered before may be returned again.
-
-        Args:
-            seen: State of the scene, as `at` returns it.
-            blender: The twin's `Blender` instance, which mixes the two images into camera frames. The method
-                `Blender.ends` converts the rendered images to linear light, and applies lens distortion and vignetting.
-
-        Returns:
-            The converted images.
-        """
+        """Return the images of the scene in the state `seen`, from `blender.ends`. They may be kept for later calls."""
 
     def prepare(self, command: str, blender: Blender) -> None:  # noqa: B027, few scenes need it
-        """Render the images that a command will need, so that later calls of `Scene.ends` return at once.
-
-        This method may be called from any thread. The base class does nothing.
-
-        Args:
-            command: `hold` holds an object on the pad, `release` lets it go, and `clear` takes it away.
-            blender: The twin's `Blender` instance, which converts the rendered images to linear light.
-        """
+        """Render the images that a command will need. May be called from any thread."""
 
     def command(self, command: str, time_s: float) -> None:
-        """Change the scene. The base class refuses every command.
-
-        Args:
-            command: `hold` holds an object on the pad, `release` lets it go, and `clear` takes it away.
-            time_s: Time on the twin's clock from which the change applies (s). It must not decrease between calls.
-
-        Raises:
-            ValueError: The command is unknown or not possible in the current phase of the scene, or `time_s` is earlier
-                than in the previous call.
-        """
-        raise ValueError(
-            f"command is {command!r}, but this scene takes no commands, because a {type(self).__name__} does not "
-            "change: use a scene with an object, such as ObjectScene"
-        )
+        """Change the scene from a time on (s), which does not decrease between calls."""
+        raise ValueError(f"command is {command!r}, but a {type(self).__name__} does not change: use an ObjectScene")
 
     def start(self, blender: Blender) -> None:  # noqa: B027, few scenes need it
-        """Start a thread that renders images before they are needed.
-
-        The base class does nothing. `Served` calls this method, because a served twin runs on the real clock. A twin on
-        its virtual clock does not need the thread.
-
-        Args:
-            blender: The twin's `Blender` instance, which converts the rendered images to linear light.
-        """
+        """Start a thread that renders images before a served twin needs them."""
 
     def close(self) -> None:  # noqa: B027, few scenes need it
         """Stop the thread that `start` has started, if there is one."""
 
 
 class Picture(Scene):
-    """A scene that never changes, given by two images, such as images of a calibration board with LEDs off and on."""
+    """A scene that never changes, such as a calibration board: its sRGB images with the LEDs off and at full power."""
 
     def __init__(self, visual: np.ndarray, tactile: np.ndarray):
-        """Store the images.
-
-        Args:
-            visual: Image with the LEDs off, sRGB in [0, 1], shape (height, width, 3).
-            tactile: Image with the LEDs at full power, of the same form.
-        """
+        """Store the images, in [0, 1], shape (height, width, 3)."""
         self._images = np.asarray(visual), np.asarray(tactile)
         self._ends: tuple[Blender, Ends] | None = None
 
     def at(self, time_s: float) -> Seen:
-        """Return the state of the scene, which is the same at all times. See `Scene.at` for the argument."""
+        """Return the only state."""
         del time_s
         return Seen(Phase.STILL, 0, 0, None)
 
     def ends(self, seen: Seen, blender: Blender) -> Ends:
-        """Convert the two images of the `Picture` to linear light, and apply the lens distortion and the vignetting.
-
-        See `Scene.ends` for the arguments. The argument `seen`, the state of the scene, has no effect on the images.
-        """
+        """Return the two images, converted once."""
         del seen
         if self._ends is None or self._ends[0] is not blender:
             self._ends = blender, blender.ends(*self._images)
@@ -159,33 +106,22 @@ class _Motion(NamedTuple):
     outcome: str  # outcome in words
 
     def drawn(self, elapsed_s: float, motion_rate: float) -> int:
-        """The index of the pose that is rendered at a time after the release.
-
-        A moving object changes its rendered pose `motion_rate` times per second. An object at rest is in the last pose.
-
-        Args:
-            elapsed_s: Time since the release (s).
-            motion_rate: Rendered poses per second of the motion.
-        """
+        """Index of the pose that is rendered at a time after the release (s). An object at rest is in the last pose."""
         frame = round(int(elapsed_s * motion_rate) * self.rate / motion_rate)
         return frame if elapsed_s * self.rate < self.rest and frame < self.rest else len(self.pose) - 1
 
     def indices(self, motion_rate: float) -> list[int]:
-        """The indices of all rendered poses: the first pose, the last pose, then the poses of the motion."""
+        """Indices of all rendered poses: the first pose, the last pose, then the poses of the motion."""
         steps = int(self.rest / self.rate * motion_rate) + 1
         moving = [self.drawn(step / motion_rate, motion_rate) for step in range(steps)]
         return list(dict.fromkeys([0, len(self.pose) - 1, *moving]))
 
 
 class ObjectScene(Scene):
-    """A scene with one object. Commands place the object on the pad, release it and take it away.
-
-    The motion of the object is simulated in advance: `physics.simulate` computes trajectories of a scenario, such as
-    `physics.Released`. Trajectories that end before the object has come to rest are skipped.
+    """A scene with one object, which follows simulated trajectories of a scenario.
 
     The pad is empty at first. The command `hold` places the object in the first pose of the next trajectory, `release`
-    lets it go, and `clear` takes it away. After the release, the object follows the trajectory. The scene shows
-    `motion_rate` poses per second until the object is at rest, and the last pose from then on.
+    lets it go, and `clear` takes it away. Trajectories that end before the object has come to rest are skipped.
     """
 
     def __init__(
@@ -204,27 +140,22 @@ class ObjectScene(Scene):
         Args:
             body: Object on the pad.
             sensor: Constants of the sensor. Default: `Sensor()`, the paper's sensor.
-            scenario: Scenario whose trajectories the object follows. Default: `physics.Released()`.
+            scenario: Scenario of the trajectories. Default: `physics.Released()`.
             resolution: (height, width) of the rendered view (pixels).
             motion_rate: Rendered poses per second of a moving object, > 0. Each pose is rendered once. Default: 10 for
                 views of up to 640 x 480 pixels, and proportionally fewer for larger views, but at least 1.
             seed: Seed of the trajectories.
-            first: Number of the first trajectory, >= 0. Use it to continue an earlier scene of the same seed.
-
-        Raises:
-            ValueError: `first`, `motion_rate` or a field of the scenario is out of range.
+            first: Number of the first trajectory, to continue an earlier scene of the same seed.
         """
-        if first < 0:
-            raise ValueError(f"`first` must be the number of a trajectory, >= 0, got {first}")
         if motion_rate is None:
             motion_rate = max(1.0, MOTION_RATE * min(1.0, _MOTION_PIXELS / math.prod(resolution)))
         if not 0 < motion_rate < float("inf"):
             raise ValueError(f"motion_rate must be positive and finite, got {motion_rate}")
         self.sensor = Sensor() if sensor is None else sensor
         self.exposure = float(self.sensor.room.exposure)
+        self.scenario = physics.Released() if scenario is None else scenario
+        self.scenario.check()
         self._body = body
-        self._scenario = physics.Released() if scenario is None else scenario
-        self._scenario.check()
         self._resolution = resolution
         self._motion_rate = motion_rate
         self._key = jax.random.key(seed)
@@ -236,28 +167,12 @@ class ObjectScene(Scene):
         self._wake, self._stop = threading.Event(), threading.Event()
         self._thread: threading.Thread | None = None
 
-    @property
-    def scenario(self) -> physics.Scenario:
-        """The scenario whose trajectories the object follows."""
-        return self._scenario
-
     def outcome(self, trajectory: int) -> str:
-        """The outcome of a trajectory in words, such as "topples", as `Scenario.named` returns it.
-
-        Args:
-            trajectory: Number of the trajectory, from 0. A trajectory that was not simulated before is simulated now.
-
-        Raises:
-            ValueError: The object does not come to rest in any of 32 successive simulated trajectories.
-        """
+        """The outcome of a trajectory (number from 0) in words, such as "topples"."""
         return self._motion(trajectory).outcome
 
     def at(self, time_s: float) -> Seen:
-        """Return the state of the scene at a time (s), see `Scene.at`.
-
-        Raises:
-            ValueError: The object does not come to rest in any of 32 successive simulated trajectories.
-        """
+        """Return the state of the scene at a time (s)."""
         index = bisect.bisect_right(self._events, time_s, key=lambda event: event[0]) - 1
         since_s, phase, number = self._events[max(index, 0)]
         if phase is Phase.EMPTY:
@@ -269,17 +184,13 @@ class ObjectScene(Scene):
         return Seen(phase, number, frame, tuple(float(value) for value in motion.pose[frame]))
 
     def ends(self, seen: Seen, blender: Blender) -> Ends:
-        """Return the image with the LEDs off and the image with the LEDs at full power, see `Scene.ends`.
-
-        If the argument `seen` contains a pose, the images show the object in this pose. Otherwise, they show the empty
-        pad. The images of each pose are rendered only once.
-        """
+        """Return the images of the object's pose, or of the empty pad. Each pose is rendered once."""
         if seen.phase is Phase.EMPTY:
             return self._render(-1, 0, blender)
         return self._render(seen.trajectory, seen.frame, blender)
 
     def prepare(self, command: str, blender: Blender) -> None:
-        """Render the images that the command `hold`, `release` or `clear` will need, see `Scene.prepare`."""
+        """Render the images that a command will need."""
         number = self._events[-1][2]
         match command:
             case "hold":
@@ -291,20 +202,8 @@ class ObjectScene(Scene):
                 self._render(-1, 0, blender)
 
     def command(self, command: str, time_s: float) -> None:
-        """Hold, release or remove the object.
-
-        Args:
-            command: `hold` holds the object in the first pose of the next trajectory, `release` lets it go, and `clear`
-                takes it away.
-            time_s: Time on the twin's clock from which the change applies (s). It must not decrease between calls.
-
-        Raises:
-            ValueError: The command is unknown, `release` comes without a held object, `time_s` is earlier than in the
-                previous call, or the object does not come to rest in any of 32 successive simulated trajectories.
-        """
-        last_s, _, number = self._events[-1]
-        if time_s < last_s:
-            raise ValueError(f"time_s must be at least {last_s} s, the time of the last command, got {time_s} s")
+        """Hold, release or remove the object from a time on (s)."""
+        _, _, number = self._events[-1]
         phase = self.at(time_s).phase
         match command:
             case "hold":
@@ -314,9 +213,7 @@ class ObjectScene(Scene):
             case "clear":
                 self._events.append((time_s, Phase.EMPTY, number))
             case "release":
-                raise ValueError(
-                    f"command is 'release', but there is no held object in the phase '{phase}': send 'hold' first"
-                )
+                raise ValueError(f"command is 'release', but the phase is '{phase}': send 'hold' first")
             case _:
                 raise ValueError(f"command must be 'hold', 'release' or 'clear', got {command!r}")
         del self._events[:-_EVENTS]
@@ -333,7 +230,7 @@ class ObjectScene(Scene):
             self._thread.start()
 
     def close(self) -> None:
-        """Stop the thread that `start` has started. If the thread is rendering an image, it completes this image."""
+        """Stop the thread that `start` has started, after the image that it renders."""
         self._stop.set()
         self._wake.set()
         if self._thread is not None:
@@ -360,26 +257,26 @@ class ObjectScene(Scene):
         with self._working:
             attempts = 0
             while len(self._motions) <= number:
-                found = self._simulate()
-                attempts = 0 if found else attempts + 1
+                settled = self._simulate()
+                attempts = 0 if settled else attempts + 1
                 if attempts == _ATTEMPTS:
                     raise ValueError(
                         f"the object did not come to rest in any of {_ATTEMPTS * _BATCH} simulated trajectories of "
-                        f"{self._scenario.frames} frames each: give the scenario more frames (scenario.frames)"
+                        f"{self.scenario.frames} frames each: give the scenario more frames (scenario.frames)"
                     )
-                self._motions += found
+                self._motions += settled
             return self._motions[number]
 
     def _simulate(self) -> list[_Motion]:
         """Simulate the next batch of trajectories, and return those in which the object comes to rest."""
         key = jax.random.fold_in(self._key, self._batches)
         self._batches += 1
-        found = physics.simulate(key, self._body, self.sensor, self._scenario, num=_BATCH)
-        poses, wrenches = np.asarray(found.pose), np.asarray(found.wrench)
+        batch = physics.simulate(key, self._body, self.sensor, self.scenario, num=_BATCH)
+        poses, wrenches = np.asarray(batch.pose), np.asarray(batch.wrench)
         return [
-            _Motion(poses[i], wrenches[i], self._scenario.rate, _rest(poses[i]), self._scenario.named(int(outcome)))
-            for i, outcome in enumerate(found.outcome)
-            if found.settled[i]
+            _Motion(poses[i], wrenches[i], self.scenario.rate, _rest(poses[i]), self.scenario.named(int(outcome)))
+            for i, outcome in enumerate(batch.outcome)
+            if batch.settled[i]
         ]
 
     def _render(self, trajectory: int, frame: int, blender: Blender) -> Ends:

@@ -3,14 +3,19 @@
 import numpy as np
 
 from sts_jax.hardware import protocol
+from sts_jax.hardware.collecting import Action, AutomaticPerson, View
+from sts_jax.hardware.guide import Stage
 from sts_jax.hardware.leds import Lit
 from sts_jax.hardware.proof import LightError, Pair, Settling, Shot, Stream, Switch, settling, thumbnail
-from sts_jax.hardware.session import Origin
+from sts_jax.hardware.session import Origin, Session
 from sts_jax.hardware.sts import checked_levels
 from sts_jax.hardware.twin.device import Twin
 
 CAMERA = "twin"  # name of the camera in sessions and sensor files
 _SWITCHES = 8  # number of switches in each direction from which the settling times are measured
+_UNSEEN_S = 3.0  # time without a visible contact after which the next held pose is tried (s)
+_UNSEEN = 10  # held poses in a row without a visible contact after which the hand gives up
+_UNMOVED_S = 3.0  # time without motion after a release after which the object counts as resting where it was (s)
 _WATCH_S = 1.0  # time after a switch during which frames are watched (s). The light must not change after it
 # Share of the frame period by which the start of each measured switch advances, so that the switches sample the whole
 # period. It is the golden ratio, whose multiples are spread evenly.
@@ -147,3 +152,71 @@ class VirtualSensor:
             delays.append(self._twin.now_s - lit.acknowledged_s)
             looks.append(thumbnail(image))
         return Switch(np.array(delays, np.float32), np.array(looks, np.float32))
+
+
+class Hand(AutomaticPerson):
+    """Replaces the person in `hardware.collect`: moves the object of a `Twin` and confirms every trajectory.
+
+    If no contact is seen within 3 s, the hand tries the first pose of the next trajectory, and the number stays unused
+    in the session. A trajectory has the same number in session and scene if the scene was made with
+    `ObjectScene(first=hardware.next_recording(folder))`.
+    """
+
+    def __init__(self, twin: Twin, session: Session, *, patience_s: float = 60.0):
+        """Prepare the hand.
+
+        Args:
+            twin: Twin whose object the hand moves.
+            session: Session that receives the trajectories.
+            patience_s: Longest time without a new instruction, > 0 (s on the twin's clock).
+        """
+        super().__init__()
+        self._twin, self._session = twin, session
+        self._patience_s = patience_s
+        self._seen: Stage | None = None  # stage of the last view
+        self._since_s = self._now_s = 0.0  # begin of that stage, and time of the last view (s)
+        self._placed = False  # True if the object is on the pad
+        self._held_s: float | None = None  # time since which the object is held without a problem of the session (s)
+        self._unseen = 0  # held poses in a row without a visible contact
+
+    def show(self, view: View) -> None:
+        """Move the object as the newest instruction requires. Raises an error if the collection does not go on."""
+        super().show(view)
+        entered, self._seen = view.stage is not self._seen, view.stage
+        self._now_s = self._twin.now_s
+        if entered or view.problem is not None:
+            self._since_s = self._now_s
+        if view.problem is not None and self._held_s is not None:
+            self._held_s = self._now_s
+        match view.stage:
+            case Stage.CLEAR if self._placed:
+                self._twin.command("clear")
+                self._placed, self._held_s = False, None
+            case Stage.PLACE:
+                self._place()
+            case Stage.RELEASE if self._held_s is not None:
+                self._twin.command("release")
+                self._held_s, self._unseen = None, 0
+        if self._now_s - self._since_s > self._patience_s or self._unseen == _UNSEEN:
+            raise ValueError(
+                f"hardware.collect has shown `{view.instruction}` for {self._now_s - self._since_s:.1f} s (contact: "
+                f"{view.contact}, still: {view.still}), and {self._unseen} held poses in a row had no visible contact: "
+                f"change its config (GuideConfig), or increase patience_s ({self._patience_s:g} s)"
+            )
+
+    def action(self) -> Action | None:
+        """Confirm a trajectory that waits for its review, or a release after which nothing has moved for 3 s."""
+        if self._seen is Stage.RELEASE and self._now_s - self._since_s > _UNMOVED_S:
+            return Action.CONFIRM
+        return super().action()
+
+    def _place(self) -> None:
+        """Hold the object in the next pose, unless the guide may still see the contact of the current one."""
+        if self._held_s is None:
+            self._placed, self._held_s = True, self._now_s
+            self._twin.command("hold")
+        elif self._now_s - self._held_s > _UNSEEN_S:
+            self._held_s = self._now_s
+            self._unseen += 1
+            self._session.begin()
+            self._twin.command("hold")
