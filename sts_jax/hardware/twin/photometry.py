@@ -7,6 +7,7 @@ import sys
 from typing import NamedTuple
 
 import cv2
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
@@ -181,8 +182,8 @@ class Blender:
         # _SPARE is a power of 2. An odd step therefore visits all start positions before it repeats one.
         self._step = 2 * int(self._rng.integers(_SPARE // 2)) + 1
         values = np.arange(_FULL + 1) / _FULL
-        self._to_linear = np.round(_FULL * np.asarray(to_linear(values), np.float64)).astype(np.uint16)
-        self._to_srgb = np.round(255 * np.asarray(to_srgb(values), np.float64)).astype(np.uint8)
+        self._to_linear = np.round(_FULL * np.asarray(to_linear(jnp.asarray(values, jnp.float32)))).astype(np.uint16)
+        self._to_srgb = np.round(255 * np.asarray(to_srgb(jnp.asarray(values, jnp.float32)))).astype(np.uint8)
         variance = imperfections.read_noise**2 + values / imperfections.full_well
         self._deviation = (_FULL * np.sqrt(variance)).astype(np.float32)
 
