@@ -215,7 +215,8 @@ class Twin:
             seen = self.scene.at((start + end) / 2)
             self._frames += 1
         self._due_s = max(self._due_s, end + constants.lag_s + self._random.uniform(0, constants.jitter_s))
-        exposure = Exposure(index, start, end, self._due_s, *light, *seen)
+        phase, trajectory, frame, pose = seen
+        exposure = Exposure(index, start, end, self._due_s, *light, phase, trajectory, frame, pose)
         image = self.blender.frame(self.scene.ends(seen, self.blender), light.mean)
         jpeg = photometry.encode(image, constants.jpeg_quality)
         if self._jpegs is not None:

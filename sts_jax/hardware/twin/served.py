@@ -11,6 +11,7 @@ import threading
 import time
 import tty
 from collections import deque
+from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 
@@ -109,7 +110,7 @@ class CameraThread:
         return self._stop.is_set()
 
     @contextlib.contextmanager
-    def client(self):
+    def client(self) -> Iterator[None]:
         """Register a client for the duration of the `with` block."""
         with self._changed:
             self._clients += 1
