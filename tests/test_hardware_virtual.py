@@ -229,9 +229,7 @@ def test_a_pose_without_contact_is_left_out_with_its_number(tmp_path):
 
 
 def test_a_guide_that_waits_for_ever_ends_with_an_error(tmp_path):
-    with pytest.raises(ValueError, match=r"Place the object.*still: True\)\. .*without a detected contact: 10\."):
+    with pytest.raises(ValueError, match=r"Place the object.*still: True\), and 10 held poses"):
         collected(Spots(unseen=range(20)), tmp_path / "unseen", 1)
-    with pytest.raises(ValueError, match=r"Take everything.* for 0.\d s .*of hardware.collect do not suit"):
+    with pytest.raises(ValueError, match=r"Take everything.* for 0.\d s .*increase patience_s \(0\.1 s\)"):
         collected(Spots(), tmp_path / "impatient", 1, patience_s=0.1)
-    with pytest.raises(ValueError, match="patience_s must be > 0, got 0"):
-        collected(Spots(), tmp_path / "none", 1, patience_s=0.0)
