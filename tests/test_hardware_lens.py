@@ -52,15 +52,10 @@ def random_points(number=200):
 
 
 @LENSES
-def test_projection_equals_the_closed_form(lens):
+def test_projection_equals_the_closed_form_and_opencv(lens):
     points = random_points()
     expected = np.array([pixel_of_point(lens, point) for point in points])
     np.testing.assert_allclose(hardware.project(lens, points), expected, atol=1e-9)
-
-
-@LENSES
-def test_projection_equals_opencv(lens):
-    points = random_points()
     matrix = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]])
     vectors = np.array(lens.rotation), np.array(lens.translation)
     expected, _ = cv2.fisheye.projectPoints(points[None], *vectors, matrix, np.array(lens.k))
