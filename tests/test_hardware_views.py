@@ -49,6 +49,17 @@ def test_recorded_images_are_in_the_order_of_the_trajectories(tmp_path):
                 np.testing.assert_allclose(there.mean(0), centre, atol=0.7)
 
 
+def test_the_identity_changes_with_the_confirmed_trajectories(tmp_path):
+    record(tmp_path / "work", 2)
+    folder = tmp_path / "work" / "dataset"
+    before = hardware.load_recordings(folder).identity
+    assert hardware.load_recordings(folder).identity == before
+    hardware.discard_recording(folder, 1)
+    without = hardware.load_recordings(folder).identity
+    hardware.restore_recording(folder, 1)
+    assert hardware.load_recordings(folder).identity == before != without
+
+
 def test_images_of_another_size_than_the_lens_are_refused(tmp_path):
     record(tmp_path / "work", 1)
     lens = dataclasses.replace(LENS, width=640, height=480)
