@@ -18,8 +18,8 @@ import numpy as np
 import tyro
 
 import sts_jax as sts
-from experiments.shared import twin_device
-from experiments.shared.live import Backgrounds, Views
+from experiments.shared.device import TwinConfig, make_twin
+from experiments.shared.live import Views
 from sts_jax import hardware
 
 MODELS = ("freefall", "inclined", "perturbed", "released")
@@ -47,7 +47,7 @@ def collect(args: Args) -> tuple[Pair, list[Pair], list[Pair]]:
         rest. A pair is a visual and a tactile image. Each list has one pair per trajectory.
     """
     # The images during the motion are not read, so one pose per second of the motion is rendered.
-    with twin_device.make(twin_device.Config(motion_rate=1.0, seed=args.seed)) as device:
+    with make_twin(TwinConfig(motion_rate=1.0, seed=args.seed)) as device:
 
         def pair() -> Pair:
             images = []
@@ -124,7 +124,7 @@ def main(args: Args) -> None:
     print(f"{args.trajectories} trajectories. Skill of the images at rest:\n")
     print("| backgrounds | prediction | from | visual | tactile | `fell off`, mean |\n|---|---|---|---|---|---|")
     for divided in (False, True):
-        views = Views(lens, pinhole, Backgrounds(*empty, divided))
+        views = Views(lens, pinhole, empty, divided)
         word = "divided out" if divided else "kept"
         for name in MODELS:
             predictor = sts.Predictor.load(name)

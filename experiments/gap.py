@@ -5,17 +5,15 @@
     python -m experiments.gap --real runs/real/dataset --sensor bench --simulated runs/released/dataset --match none
 
 `--real` is a folder of trajectories that `experiments.real collect` recorded with a sensor. `--simulated` is a folder
-that `experiments.real collect --twin` recorded with the digital twin, a simulated sensor. It may also be the dataset of
-an experiment that was run with `--collection.no-crop`. `--sensor` and `--simulated-sensor` are the sensor files of the
-real sensor and of the digital twin. Raw images are rectified with the calibration of the lens in these files. By
-default, a real and a simulated trajectory with the same number must show the same object in the same poses. Give
-`--match none` if the two folders show the same object in different poses.
+that `experiments.real collect --twin` recorded with the digital twin, or the dataset of an experiment that was run with
+`--collection.no-crop`. `--sensor` and `--simulated-sensor` are the sensor files of the real sensor and of the twin,
+with whose lenses the raw images are rectified. By default, a real and a simulated trajectory with the same number must
+show the same object in the same poses. Give `--match none` if the two folders show the same object in different poses.
 
 The command prints the distance between the distributions of real and simulated images in a feature space, and the
 accuracy of a classifier that tries to distinguish real from simulated images. With `--match number`, the default, it
-also prints differences per pixel. The command
-writes the printed text and a figure of the images to the folder `--out`. The command takes about a minute for 40
-trajectories. The classifier needs scikit-learn (`pip install -e '.[bench]'`).
+also prints differences per pixel. The text and a figure of the images go to the folder `--out`. The command takes about
+a minute for 40 trajectories. The classifier needs scikit-learn (`pip install -e '.[bench]'`).
 """
 
 import dataclasses
@@ -58,14 +56,16 @@ class Config:
 
 @dataclasses.dataclass(frozen=True)
 class Side:
-    """Either the real images or the simulated images, with a description of their source.
-
-    The visual images and the tactile images have the same order: the initial and the final image of the first
-    trajectory, then those of the second trajectory, and so on.
-    """
+    """The real or the simulated images: the initial and the final one of the first trajectory, of the second, ..."""
 
     images: gap.Streams  # images of both streams, with the number of their trajectory
     described: str  # description of the source
+
+    @classmethod
+    def of_pairs(cls, visual: np.ndarray, tactile: np.ndarray, numbers: np.ndarray, described: str) -> "Side":
+        """Make a side of initial and final images, shape (n, 2, height, width, 3), of n numbered trajectories."""
+        visual, tactile = (leaf.reshape(-1, *leaf.shape[2:]) for leaf in (visual, tactile))
+        return cls(gap.Streams(visual, tactile, np.repeat(numbers, 2)), f"{described}, {len(numbers)} trajectories")
 
     def of(self, numbers: np.ndarray) -> "Side":
         """Select the images whose trajectory number is in `numbers`."""
@@ -74,83 +74,40 @@ class Side:
 
 
 def session(folder: Path, sensor: Path | None, resolution: tuple[int, int]) -> Side:
-    """Read the images that `experiments.real collect` recorded, and rectify them with the lens of a sensor file.
-
-    Args:
-        folder: Folder of the recorded trajectories.
-        sensor: Path of the sensor file. None: the images are rectified already.
-        resolution: (height, width) of the result (pixels).
-
-    Raises:
-        FileNotFoundError: There are no recorded trajectories or no sensor file.
-        SensorFileError: The sensor file is damaged or describes no device.
-        ValueError: None of the recorded trajectories was confirmed by the user, or the lens was calibrated with images
-            of another size.
-    """
+    """Read the images of a session, and rectify them with the lens of a sensor file, unless there is none."""
     recordings = hardware.load_recordings(folder)
     size = f"{resolution[0]} x {resolution[1]}"
     if sensor is None:
         described = f"taken as rectified, reduced to {size}"
-
-        def convert(image: np.ndarray) -> np.ndarray:
-            return centred(image, resolution)
+        images = recordings.images(lambda image: centred(image, resolution))
     else:
-        lens, pinhole = (
-            hardware.Device.load(sensor).lens,
-            sts.Sensor.load(hardware.sensor_file.sensor_file(sensor)).camera,
-        )
+        lens = hardware.Device.load(sensor).lens
+        pinhole = sts.Sensor.load(hardware.sensor_file.sensor_file(sensor)).camera
         described = f"rectified with the lens of {sensor} to {size}"
-
-        def convert(image: np.ndarray) -> np.ndarray:
-            return hardware.rectified(lens, pinhole, image, resolution)
-
-    found = recordings.images(convert)
-    return side(found.visual, found.tactile, found.number, f"{folder}, {described}")
+        images = recordings.images(lambda image: hardware.rectified(lens, pinhole, image, resolution))
+    return Side.of_pairs(images.visual, images.tactile, images.number, f"{folder}, {described}")
 
 
 def simulated_dataset(folder: Path, resolution: tuple[int, int] | None) -> Side:
-    """Read the first and the last frame of each rendered trajectory of a dataset.
-
-    Args:
-        folder: Folder of the dataset.
-        resolution: (height, width) that the images must have (pixels). None: any size is accepted.
-
-    Raises:
-        ValueError: The images have another size than `resolution`, or are cropped to the object.
-    """
+    """Read the first and the last frame of each rendered trajectory of a dataset."""
     data = dataset.load(folder)
     if data.collection["crop"]:
         raise ValueError(
             f"the images of {folder} are cropped to the object, but real images show the whole pad: collect the "
             "dataset again with --collection.no-crop"
         )
-    own = tuple(data.collection["resolution"])
-    if resolution is not None and resolution != own:
+    size = tuple(data.collection["resolution"])
+    if resolution is not None and resolution != size:
         raise ValueError(
-            f"--resolution is {resolution}, but the images of {folder} have the size {own}: leave out --resolution"
+            f"--resolution is {resolution}, but the images of {folder} have the size {size}: leave out --resolution"
         )
     pairs = data.pairs(data.rendered())
-    return side(pairs.visual, pairs.tactile, pairs.trajectory, f"{folder}, a dataset of {own[0]} x {own[1]}")
-
-
-def side(visual: np.ndarray, tactile: np.ndarray, numbers: np.ndarray, described: str) -> Side:
-    """Make a `Side`, which holds either the real or the simulated images, from the images of n trajectories.
-
-    Args:
-        visual: Initial and final visual images, shape (n, 2, height, width, 3).
-        tactile: Initial and final tactile images, of the same shape.
-        numbers: Trajectory number of each of the n trajectories.
-        described: Description of the source of the images, such as their folder.
-    """
-    visual, tactile = (leaf.reshape(-1, *leaf.shape[2:]) for leaf in (visual, tactile))
-    return Side(gap.Streams(visual, tactile, np.repeat(numbers, 2)), f"{described}, {len(numbers)} trajectories")
+    described = f"{folder}, a dataset of {size[0]} x {size[1]}"
+    return Side.of_pairs(pairs.visual, pairs.tactile, pairs.trajectory, described)
 
 
 def centred(image: np.ndarray, resolution: tuple[int, int]) -> np.ndarray:
-    """Crop a rectified image at its centre, and resize the crop to `resolution` by averaging pixels.
-
-    The crop has the aspect ratio of `resolution`.
-    """
+    """Crop a rectified image at its centre to the aspect ratio of `resolution`, and resize it by averaging pixels."""
     (height, width), (rows, columns) = image.shape[:2], resolution
     scale = min(height / rows, width / columns)
     tall, wide = round(rows * scale), round(columns * scale)
@@ -160,16 +117,9 @@ def centred(image: np.ndarray, resolution: tuple[int, int]) -> np.ndarray:
 
 
 def load(config: Config) -> tuple[Side, Side]:
-    """Read the real images and the simulated images.
+    """Read the real and the simulated images.
 
-    Returns:
-        The real and the simulated images. With `--match number`, the real and the simulated images have the same
-        trajectory numbers. With `--match none`, the simulated trajectories get new numbers, which differ from all
-        numbers of real trajectories.
-
-    Raises:
-        FileNotFoundError: A folder contains no session or dataset, or there is no sensor file.
-        ValueError: An option is out of range, two options contradict each other, or there is nothing to compare.
+    With `--match number`, both have the same trajectory numbers. With `--match none`, they have none in common.
     """
     is_dataset = (config.simulated / "collection.json").exists()
     if is_dataset and config.match == "number":
@@ -179,8 +129,8 @@ def load(config: Config) -> tuple[Side, Side]:
         )
     if is_dataset and config.simulated_sensor is not None:
         raise ValueError(
-            f"--simulated-sensor is {config.simulated_sensor}, but the option is only for raw images, and the images "
-            f"of the dataset {config.simulated} are already rectified: leave out --simulated-sensor"
+            f"--simulated-sensor is {config.simulated_sensor}, but the images of the dataset {config.simulated} are "
+            "already rectified: leave out --simulated-sensor"
         )
     if config.resolution is not None and min(config.resolution) < gap.LEAST_SIDE:
         raise ValueError(
@@ -205,34 +155,27 @@ def load(config: Config) -> tuple[Side, Side]:
 
 
 def report(real: Side, simulated: Side, *, matched: bool) -> str:
-    """Make the text that the command prints: the sources of the images, and a table of the measured differences."""
+    """The text that the command prints: the sources of the images, and a table of the measured differences."""
     number = len(np.unique(real.images.group))
     head = f"matched by number: {number} trajectories" if matched else "not matched"
     lines = [f"real:      {real.described}", f"simulated: {simulated.described}", head, ""]
     lines.append(f"{'':42s}{'visual':26s}{'tactile':26s}".rstrip())
-    rows: dict[str, list[str]] = {}
-    for stream in STREAMS:
-        for name, value in measured(real.images, simulated.images, stream, matched=matched).items():
-            rows.setdefault(name, []).append(value)
-    lines += [f"{name:42s}{''.join(f'{value:26s}' for value in values)}".rstrip() for name, values in rows.items()]
-    lines += ["", "In brackets: 95 % interval over trajectories (bootstrap)."]
-    return "\n".join(lines)
+    columns = [measured(real.images, simulated.images, stream, matched=matched) for stream in STREAMS]
+    for name in columns[0]:
+        lines.append(f"{name:42s}{''.join(f'{column[name]:26s}' for column in columns)}".rstrip())
+    return "\n".join([*lines, "", "In brackets: 95 % interval over trajectories (bootstrap)."])
 
 
 def measured(real: gap.Streams, simulated: gap.Streams, stream: str, *, matched: bool) -> dict[str, str]:
-    """Compare the real with the simulated images of one stream, "visual" or "tactile".
-
-    Returns:
-        Formatted values by the names of the metrics.
-    """
+    """Compare the real with the simulated images of one stream: formatted values by the names of the metrics."""
     first, second = getattr(real, stream), getattr(simulated, stream)
     rows = {}
     if matched:
-        found = gap.pixel_errors(first, second, real.group)
-        rows["mean absolute error (of 255)"] = written(found.mae, 2)
-        rows["root mean squared error (of 255)"] = written(found.rmse, 2)
-        rows["PSNR (dB)"] = written(found.psnr, 1)
-        rows["SSIM"] = written(found.ssim, 3)
+        errors = gap.pixel_errors(first, second, real.group)
+        rows["mean absolute error (of 255)"] = written(errors.mae, 2)
+        rows["root mean squared error (of 255)"] = written(errors.rmse, 2)
+        rows["PSNR (dB)"] = written(errors.psnr, 1)
+        rows["SSIM"] = written(errors.ssim, 3)
         # A shift by two images pairs each image with the same end of another trajectory.
         other = gap.pixel_errors(first, np.roll(second, 2, axis=0), real.group)
         rows["  same, for another trajectory: MAE"] = written(other.mae, 2)
@@ -251,28 +194,19 @@ def written(estimate: gap.Estimate, digits: int) -> str:
 
 def draw(config: Config, real: Side, simulated: Side, *, matched: bool) -> None:
     """Draw the real and the simulated images of the first `config.rows` trajectories into `gap.png`."""
-    rows = config.rows
-    numbers = np.unique(real.images.group)[:rows]
-    others = numbers if matched else np.unique(simulated.images.group)[:rows]
+    numbers = np.unique(real.images.group)[: config.rows]
+    others = numbers if matched else np.unique(simulated.images.group)[: config.rows]
     shown = min(len(numbers), len(others))
     first, second = real.of(numbers[:shown]).images, simulated.of(others[:shown]).images
-    labels = [
-        f"{'#' + str(number) if matched else 'draw'}\n{end}"
-        for number in numbers[:shown]
-        for end in ("initial", "final")
-    ]
+    heads = [f"#{number}" if matched else "draw" for number in numbers[:shown]]
+    labels = [f"{head}\n{end}" for head in heads for end in ("initial", "final")]
     title = "the same object in the same poses" if matched else "draws of both sides, in other poses"
     path = config.out / "gap.png"
     figures.side_by_side(path, first, second, labels, matched=matched, title=title, names=config.names)
 
 
 def main(config: Config) -> None:
-    """Read the real and the simulated images, print how much they differ, and draw the figure.
-
-    Raises:
-        ValueError: An option is out of range, two options contradict each other, or there is nothing to compare.
-        OSError: A file cannot be read or written.
-    """
+    """Read the real and the simulated images, print how much they differ, and draw the figure."""
     if config.rows < 1:
         raise ValueError(f"--rows must be >= 1, got {config.rows}")
     drawing.make_folder(config.out)

@@ -25,18 +25,20 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+import PIL.Image
 import tyro
 
 import sts_jax as sts
-from experiments.shared import terminal
-from experiments.shared.live import Backgrounds, Image, Live, Seen, Views
-from experiments.shared.live_page import LivePage
-from experiments.shared.live_panel import PanelFile, lines
-from experiments.shared.own_twin import own_twin
+from experiments.shared import drawing, terminal
+from experiments.shared.device import own_twin
+from experiments.shared.live import Image, Live, Seen, Views, lines, panel
+from experiments.shared.page import LivePage
 from experiments.shared.terminal import say
 from sts_jax import hardware
 
-PRINT_S = 1.0  # time between two lines in the terminal (s)
+PRINT_S = 1.0  # time between two lines in the terminal, and between two moments of the picture (s)
+ROWS = 6  # largest number of moments in the picture, which are chosen evenly
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,7 +68,7 @@ class Config:
 
     record: Path | None = None  # record both streams into this new folder
     encoding: Literal["png", "jpeg"] = "png"  # format of recorded images. PNG is lossless, JPEG is faster and smaller
-    save: Path | None = None  # write the live view and the predictions to a picture (.png) or a video (.mp4)
+    save: Path | None = None  # write up to six moments of the live view and the predictions to a picture
     headless: bool = False  # print the predictions in this terminal instead of serving a page
     host: str = "127.0.0.1"  # address of the page. With 0.0.0.0, every computer of the network can watch
     port: int = 8766  # TCP port of the page. 0 selects a free one
@@ -75,33 +77,23 @@ class Config:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Source:
-    """The source of the live images: a sensor, a digital twin or a recording.
-
-    The function `follow` connects to the source, and reads its images.
-    """
+    """The source of the live images: a sensor, a digital twin or a recording."""
 
     name: str  # description for the title of the page
-    sensor: hardware.STS | hardware.Replay  # device or recording
+    sensor: hardware.STS | hardware.Replay  # device or recording, not yet connected
     file: Path | None  # path of the sensor file, or None without one
     connected: Callable[[], None] = lambda: None  # function that is called when the sensor is connected
     note: Callable[[], str] = lambda: ""  # function that returns a remark on the present state of the source
 
 
 def check(config: Config) -> None:
-    """Check the options before any work.
-
-    Raises:
-        ValueError: Two options contradict each other, an option is missing or out of range, or there is no sensor file.
-    """
-    given = [
-        name
-        for name, there in (
-            ("--twin", config.twin),
-            ("--replay", bool(config.replay)),
-            ("--camera/--leds", config.camera is not None or config.leds is not None),
-        )
-        if there
-    ]
+    """Check the options before any work."""
+    sources = {
+        "--twin": config.twin,
+        "--replay": bool(config.replay),
+        "--camera/--leds": config.camera is not None or config.leds is not None,
+    }
+    given = [name for name, there in sources.items() if there]
     if len(given) > 1 or (config.twin and config.sensor is not None):
         options = " and ".join(given if len(given) > 1 else ["--twin", "--sensor"])
         raise ValueError(f"{options} exclude each other: choose one source of images")
@@ -125,16 +117,20 @@ def check(config: Config) -> None:
         raise ValueError(
             "--record and --replay exclude each other: leave out one of them. To duplicate a recording, copy its folder"
         )
+    if config.save is not None:
+        drawing.check_picture(config.save)
 
 
 @contextlib.contextmanager
 def opened(config: Config) -> Iterator[Source]:
-    """Make the source of images that the options select: a replay, a real sensor or a digital twin.
-
-    A digital twin is started here, and stopped at the end of the `with` block.
-    """
+    """Open the source that the options select. A digital twin runs until the end of the `with` block."""
     if config.replay:
-        yield replayed(config)
+        first, file = config.replay[0], config.sensor
+        path = first if len(config.replay) == 1 else (first, config.replay[1])
+        replay = hardware.Replay(path, speed=config.speed, loop=config.loop)
+        if file is None and replay.device is not None:
+            file = first
+        yield Source(f"a recording in {first.parent if isinstance(path, tuple) else first}", replay, file)
     elif config.camera is not None and config.leds is not None and config.sensor is None:
         camera = hardware.CameraConfig(config.camera, None, None)
         yield Source(config.camera, hardware.STS(camera=camera, leds=config.leds), None)
@@ -148,30 +144,8 @@ def opened(config: Config) -> Iterator[Source]:
             yield Source("a digital twin of the sensor", sensor, twin.folder, twin.start, lambda: twin.note)
 
 
-def replayed(config: Config) -> Source:
-    """Open the recording that `--replay` selects. Without `--sensor`, the sensor file in the recording is used."""
-    first, file = config.replay[0], config.sensor
-    path = first if len(config.replay) == 1 else (first, config.replay[1])
-    sensor = hardware.Replay(path, speed=config.speed, loop=config.loop)
-    if file is None and sensor.device is not None:
-        file = first
-    return Source(f"a recording in {first.parent if isinstance(path, tuple) else first}", sensor, file)
-
-
 def views(config: Config, source: Source, first: hardware.Shot) -> Views:
-    """Return a `Views`, which converts raw images to rectified images.
-
-    A rectified image is the image that the sensor's pinhole camera would take.
-
-    Args:
-        config: Options of the command line.
-        source: Source of the images.
-        first: Any image of the source. Without a sensor file, an ideal lens for images of the size of `first` is
-            assumed.
-
-    Returns:
-        The object that converts the images.
-    """
+    """The conversion from raw images. Without a sensor file, the lens is ideal for images of the size of `first`."""
     if source.file is None:
         height, width = first.image.shape[:2]
         say(
@@ -181,36 +155,23 @@ def views(config: Config, source: Source, first: hardware.Shot) -> Views:
         return Views(hardware.Lens.ideal(width, height), sts.Sensor().camera, None)
     device = hardware.Device.load(source.file)
     pinhole = sts.Sensor.load(hardware.sensor_file.sensor_file(source.file)).camera
-    empty = device.backgrounds(source.file)
-    return Views(device.lens, pinhole, None if empty is None else Backgrounds(*empty, config.flat))
+    return Views(device.lens, pinhole, device.backgrounds(source.file), config.flat)
 
 
 def images(config: Config, source: Source) -> Iterator[hardware.Shot]:
-    """Read the images of the visual and the tactile stream from the connected source, until the source ends."""
+    """Read the images of both streams from the connected source, until the source ends."""
     if isinstance(source.sensor, hardware.Replay):
         return source.sensor.stream()
     return source.sensor.stream(0.5, dwell=config.dwell)
 
 
 class Screen:
-    """The outputs of the command: the web page or the lines in the terminal, and the file of `--save`."""
+    """The outputs of the command: the page or the lines in the terminal, and the picture of `--save`."""
 
     def __init__(self, config: Config, source: Source, views: Views, page: LivePage | None):
-        """Prepare the outputs.
-
-        Args:
-            config: Options of the command line.
-            source: Source of the images.
-            views: Conversion from raw images to the view of the sensor.
-            page: Page in the browser. None: the terminal is used instead.
-
-        Raises:
-            ValueError: The suffix of `--save` is neither that of a picture nor that of a video.
-            OSError: The file of `--save` cannot be written.
-        """
-        self._source, self._views, self._page = source, views, page
-        self._file = None if config.save is None else PanelFile(config.save)
-        self._path = config.save
+        """Prepare the outputs. Without a page, they are printed."""
+        self._source, self._views, self._page, self._path = source, views, page, config.save
+        self._panels: list[Image] = []  # moments of which the picture shows some
         self._shown: dict[str, tuple[Image, float]] = {}  # newest image of each stream and the time of its arrival (s)
         self._arrived_s: collections.deque[float] = collections.deque(maxlen=100)
         self._printed_s = time.monotonic()
@@ -218,65 +179,49 @@ class Screen:
         self.live: Live | None = None
 
     def add(self, shot: hardware.Shot) -> None:
-        """Process a new image: update the page or the terminal, and the file of `--save`."""
+        """Show a new image."""
         self._shown = {**self._shown, shot.stream: (self._views.shown(shot.image), shot.time_s)}
         self._arrived_s.append(shot.time_s)
         if self._recorded is not None:
             self._recorded += 1
         self.update()
-        seen = self.seen()
-        if seen is None:
+        seen, now_s = self.seen(), time.monotonic()
+        if seen is None or seen.predicted is None or now_s < self._printed_s + PRINT_S:
             return
-        if self._file is not None:
-            self._file.add(seen)
-        if self._page is None and time.monotonic() > self._printed_s + PRINT_S and seen.predicted is not None:
-            self._printed_s = time.monotonic()
+        self._printed_s = now_s
+        if self._path is not None and seen.rate > 0:
+            self._panels.append(panel(seen))
+        if self._page is None:
             chances = (f"{name} {chance:.2f}" for name, chance in seen.predicted.outcomes)
             print(", ".join([*lines(seen), *chances]), flush=True)
 
     def update(self) -> None:
-        """Update the page.
-
-        The main thread calls this method after each image. The prediction thread calls it after each prediction.
-        """
+        """Update the page, from the main thread after each image, and from the other one after each prediction."""
         seen = self.seen()
         if self._page is not None and seen is not None:
             self._page.show(seen)
 
     def seen(self) -> Seen | None:
-        """Return the newest images and the newest prediction.
-
-        Returns:
-            The images and the prediction, or None until both a visual and a tactile image have been added.
-        """
+        """The newest images and the newest prediction, or None until there is an image of each stream."""
         shown, live, arrived_s = self._shown, self.live, list(self._arrived_s)
         if len(shown) < 2 or live is None:
             return None
         rate = (len(arrived_s) - 1) / max(arrived_s[-1] - arrived_s[0], 1e-3)
         (visual, visual_s), (tactile, tactile_s) = shown["visual"], shown["tactile"]
-        return Seen(
-            visual,
-            tactile,
-            max(visual_s, tactile_s),
-            rate,
-            live.newest,
-            live.rate,
-            live.latency_s,
-            self._recorded,
-            self._source.note(),
-        )
+        newest_s, note = max(visual_s, tactile_s), self._source.note()
+        return Seen(visual, tactile, newest_s, rate, live.newest, live.rate, live.latency_s, self._recorded, note)
 
     def close(self) -> None:
-        """Complete the picture or video that the option `--save` names, and print its path."""
-        if self._file is not None and self._file.close():
+        """Write the picture, and print its path."""
+        if self._path is not None and self._panels:
+            chosen = np.unique(np.linspace(0, len(self._panels) - 1, ROWS).round().astype(int))
+            picture = np.vstack([self._panels[index] for index in chosen])
+            drawing.write_picture(self._path, PIL.Image.fromarray(picture))
             print(self._path)
 
 
 def follow(config: Config, source: Source, predictor: sts.Predictor, page: LivePage | None) -> None:
-    """Connect the source, and process its images until the source ends, `--seconds` is over or the user quits.
-
-    The command shows the images, predicts from the newest images, and records the images if `--record` is given.
-    """
+    """Connect the source, and show, predict from and record its images until it ends or the user quits."""
     with source.sensor as sensor, contextlib.ExitStack() as stack:
         prepared = views(config, source, next(images(config, source)))
         screen = Screen(config, source, prepared, page)
@@ -339,8 +284,7 @@ def main(config: Config) -> None:
                 if not config.headless:
                     page = LivePage(config.host, config.port, title=f"{source.name}. Model: {config.model}")
                     stack.callback(page.close)
-                    reach = "only this computer" if page.is_local else "EVERY computer that reaches this address"
-                    say(f"open {page.url} in a browser. The page listens on {config.host}: {reach} can watch")
+                    page.announce("watch")
                 follow(config, source, predictor, page)
         except KeyboardInterrupt:
             raise SystemExit("stopped") from None

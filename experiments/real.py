@@ -35,8 +35,7 @@ import tyro
 
 import sts_jax as sts
 from experiments.shared import table2, terminal
-from experiments.shared.collecting import Collect, collect
-from experiments.shared.reviewing import Review, review
+from experiments.shared.collecting import Collect, Review, collect, review
 from experiments.shared.run import chosen_preset
 from experiments.shared.table2 import Config, Train
 from sts_jax.training import TrainConfig

@@ -15,19 +15,16 @@ import threading
 import tyro
 
 import sts_jax as sts
-from experiments.shared import terminal
-from experiments.shared.twin_device import Config, make
+from experiments.shared.device import TwinConfig, make_twin
+from experiments.shared.terminal import on_one_line
 from sts_jax.hardware import twin
 
 
-def main(config: Config) -> None:
-    """Let other programs use the twin (a simulated sensor) until Ctrl-C or SIGTERM.
-
-    If `config.attached` is true, the end of the standard input also stops the twin.
-    """
+def main(config: TwinConfig) -> None:
+    """Let other programs use the twin until Ctrl-C, SIGTERM or, with `attached`, the end of the standard input."""
     stop = threading.Event()
     print("preparing the first images ...", flush=True)
-    with make(config) as device:
+    with make_twin(config) as device:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: stop.set())
         with twin.Served(device, link=config.port, host=config.host, http_port=config.http_port) as served:
@@ -45,5 +42,5 @@ def _until_end_of_input(stop: threading.Event) -> None:
 
 if __name__ == "__main__":
     sts.enable_compilation_cache()
-    with terminal.on_one_line():
-        main(tyro.cli(Config, description=__doc__))
+    with on_one_line():
+        main(tyro.cli(TwinConfig, description=__doc__))

@@ -16,7 +16,7 @@ import sts_jax as sts
 from benchmarks.instruments.led_peer import Peer
 from benchmarks.instruments.sensor_peer import DARK, LIT, Lights, SeenController, SeenLights
 from experiments import commission
-from experiments.shared import backgrounds, boards, commissioning
+from experiments.shared import commissioning
 from sts_jax import hardware
 from sts_jax.hardware import Device, opencv
 
@@ -117,7 +117,7 @@ def measure_briefly(monkeypatch):
     brief = functools.partialmethod(hardware.STS.measure_settling, 3, watch_s=0.5)
     monkeypatch.setattr(hardware.STS, "measure_settling", brief)
     monkeypatch.setattr(hardware.Leds, "connect", functools.partial(hardware.Leds.connect, timeout_s=1.0))
-    monkeypatch.setattr(backgrounds, "PAIRS", 5)
+    monkeypatch.setattr(commissioning, "PAIRS", 5)
 
 
 def hands(peer, monkeypatch, *, stop_at=None):
@@ -136,7 +136,7 @@ def hands(peer, monkeypatch, *, stop_at=None):
             peer.camera.board = None
         return ""
 
-    monkeypatch.setattr(boards, "wait", wait)
+    monkeypatch.setattr(commissioning, "wait", wait)
     return asked
 
 
@@ -233,7 +233,7 @@ def test_the_controller_is_found_by_its_own_serial_number(tmp_path, monkeypatch)
 
 def test_the_lens_is_fitted_from_a_folder(tmp_path, pictures, capsys):
     folder = held(tmp_path / "board", pictures)
-    lens = commissioning.fit(boards.Pictures.read(folder, hardware.Board(), (WIDTH, HEIGHT)), PINHOLE)
+    lens = commissioning.Pictures.read(folder, hardware.Board(), (WIDTH, HEIGHT)).fit(PINHOLE)
     np.testing.assert_allclose(lens.center, TRUE.center, atol=5e-4)
     printed = capsys.readouterr().out
     assert "6 pictures" in printed
@@ -256,7 +256,7 @@ def test_a_view_that_the_camera_does_not_see_is_refused(config):
 
 def test_few_pictures_name_their_folder(tmp_path, pictures):
     folder = held(tmp_path / "board", pictures, 3)
-    read = boards.Pictures.read(folder, hardware.Board(), (WIDTH, HEIGHT))
+    read = commissioning.Pictures.read(folder, hardware.Board(), (WIDTH, HEIGHT))
     with pytest.raises(hardware.CalibrationError, match=r"board failed: .*at least 6.*000.png"):
         read.fit(PINHOLE)
 
@@ -274,36 +274,34 @@ class Handheld:
         return hardware.Captured(self.images.pop(0), 0.0, 0, 0, 0, 0, False)
 
 
-def test_pictures_without_or_with_a_moving_board_are_not_kept(tmp_path, pictures):
+def test_pictures_without_or_with_a_moving_board_are_not_kept(tmp_path, pictures, capsys):
     blank, there = np.full_like(pictures[0], 90), pictures[0]
     moved = np.roll(there, 4, axis=1)
-    sensor, lines = Handheld([blank, blank, moved, there, there, there]), []
-    taken = boards.take(
-        boards.Pictures(tmp_path, hardware.Board(), (WIDTH, HEIGHT)), sensor, 1, every=0.0, say=lines.append
-    )
-    assert [line.split(",")[0] for line in lines] == [
+    sensor = Handheld([blank, blank, moved, there, there, there])
+    taken = commissioning.Pictures(tmp_path, hardware.Board(), (WIDTH, HEIGHT), {})
+    commissioning.take(taken, sensor, 1, every=0.0)
+    assert [line.split(",")[0] for line in capsys.readouterr().out.splitlines() if line[0] == " "] == [
         "  picture not kept: 0 corners of the board were found",
         "  picture not kept: the board moved while the picture was taken: hold it still",
         "  000.png: 64 corners",
     ]
-    assert taken.names == ("000.png",)
-    assert [path.name for path in tmp_path.iterdir()] == ["000.png"]
-    read = boards.Pictures.read(tmp_path, hardware.Board(), (WIDTH, HEIGHT))
-    np.testing.assert_array_equal(read.found[0].pixels, taken.found[0].pixels)
+    assert list(taken.corners) == [path.name for path in tmp_path.iterdir()] == ["000.png"]
+    read = commissioning.Pictures.read(tmp_path, hardware.Board(), (WIDTH, HEIGHT))
+    np.testing.assert_array_equal(read.corners["000.png"].pixels, taken.corners["000.png"].pixels)
 
 
 def test_a_deleted_picture_of_the_board_on_the_pad_is_taken_again_first(tmp_path, pictures, monkeypatch):
     folder = held(tmp_path / "board", pictures, 3)
     (folder / "000.png").unlink()
     asked = []
-    monkeypatch.setattr(boards, "wait", lambda text, every: asked.append(text) or "")
+    monkeypatch.setattr(commissioning, "wait", lambda text, every: asked.append(text) or "")
     sensor = Handheld([image for image in (pictures[0], pictures[3]) for _ in range(2)])
-    read = boards.Pictures.read(folder, hardware.Board(), (WIDTH, HEIGHT))
-    taken = boards.take(read, sensor, 4, every=None, say=asked.append)
-    assert asked[0].startswith("Lay the board on the pad")
-    assert asked[2].startswith("Hold the board above the pad")
-    assert taken.names == ("000.png", "001.png", "002.png", "003.png")
-    np.testing.assert_array_equal(taken.found[0].pixels, hardware.find_board(pictures[0], hardware.Board()).pixels)
+    taken = commissioning.Pictures.read(folder, hardware.Board(), (WIDTH, HEIGHT))
+    commissioning.take(taken, sensor, 4, every=None)
+    assert [text.split()[0] for text in asked] == ["Lay", "Hold"]
+    assert sorted(taken.corners) == ["000.png", "001.png", "002.png", "003.png"]
+    expected = hardware.find_board(pictures[0], hardware.Board()).pixels
+    np.testing.assert_array_equal(taken.corners["000.png"].pixels, expected)
 
 
 def test_covered_parts_are_named():
@@ -476,7 +474,7 @@ def test_a_missing_port_and_another_device_are_named(config, tmp_path, monkeypat
 def test_pictures_of_another_size_are_refused(tmp_path, pictures):
     folder = held(tmp_path / "board", pictures, 1)
     with pytest.raises(ValueError, match=r"000.png has 640 x 480 pixels, but --width is 1640 and --height is 1232"):
-        boards.Pictures.read(folder, hardware.Board(), (1640, 1232))
+        commissioning.Pictures.read(folder, hardware.Board(), (1640, 1232))
 
 
 def test_a_missing_keyboard_is_named(monkeypatch):
@@ -485,4 +483,4 @@ def test_a_missing_keyboard_is_named(monkeypatch):
 
     monkeypatch.setattr("builtins.input", closed)
     with pytest.raises(ValueError, match="give --every SECONDS"):
-        boards.wait("Take everything off the pad.", None)
+        commissioning.wait("Take everything off the pad.", None)

@@ -3,8 +3,10 @@
 import dataclasses
 import http.client
 import json
+import socket
 import threading
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
@@ -15,9 +17,8 @@ from recording_writer import ORIGIN, SIZE, shot
 
 import sts_jax as sts
 from experiments import live
-from experiments.shared.live import SIDE, Backgrounds, Live, Seen, Views
-from experiments.shared.live_page import LivePage
-from experiments.shared.live_panel import PanelFile, panel
+from experiments.shared.live import SIDE, Live, Seen, Views, panel
+from experiments.shared.page import LivePage
 from sts_jax import hardware
 
 LENS = hardware.Lens.ideal(SIZE[1], SIZE[0])
@@ -30,7 +31,7 @@ def grey(level, size=SIZE):
 
 
 def views(divided=True):
-    return Views(LENS, PINHOLE, Backgrounds(grey(EMPTY["visual"]), grey(EMPTY["tactile"]), divided))
+    return Views(LENS, PINHOLE, (grey(EMPTY["visual"]), grey(EMPTY["tactile"])), divided)
 
 
 class StubPredictor:
@@ -192,7 +193,8 @@ def test_the_page_shows_a_state_and_only_to_its_own_name():
         assert {name: facts[name] for name in expected} == expected
         assert facts["outcomes"] == [["rests", 0.9], ["fell off", 0.1]]
         assert ask(page, "/view", "evil.example")[0] == 403
-        assert ask(page, "/other.mjpg")[0] == 404
+        for path in ("/other.mjpg", "/outcomes.jpg", "/predicted_outcomes.jpg"):
+            assert ask(page, path)[0] == 404
         connection = http.client.HTTPConnection(page.host, page.port, timeout=WAIT_S)
         connection.request("GET", "/predicted_tactile.mjpg")
         answer = connection.getresponse()
@@ -203,29 +205,6 @@ def test_the_page_shows_a_state_and_only_to_its_own_name():
         connection.close()
     finally:
         page.close()
-
-
-def test_files_of_panels(tmp_path, monkeypatch):
-    now = [100.0]
-    monkeypatch.setattr("experiments.shared.live_panel.time.monotonic", lambda: now[0])
-    height, width = panel(seen()).shape[:2]
-    for name, count in (("a.png", 6), ("b.mp4", 100)):
-        file = PanelFile(tmp_path / name)
-        for _ in range(200):  # 10 s
-            file.add(seen())
-            now[0] += 0.05
-        file.add(seen(rate=0.0))
-        assert file.close()
-        if name == "a.png":
-            assert cv2.imread(str(tmp_path / name)).shape == (count * height, width, 3)
-        else:
-            video = cv2.VideoCapture(str(tmp_path / name))
-            assert abs(video.get(cv2.CAP_PROP_FRAME_COUNT) - count) <= 2
-    assert not PanelFile(tmp_path / "c.png").close()
-    with pytest.raises(ValueError, match=r"save is .*\.txt, but its suffix must be one of .png"):
-        PanelFile(tmp_path / "a.txt")
-    with pytest.raises(FileNotFoundError, match="does not exist"):
-        PanelFile(tmp_path / "none" / "a.png")
 
 
 @pytest.mark.parametrize(
@@ -239,6 +218,7 @@ def test_files_of_panels(tmp_path, monkeypatch):
         ({"seconds": 0.0}, "seconds must be > 0, got 0"),
         ({"dwell": 0}, "dwell must be >= 1, got 0"),
         ({"replay": ("a",), "record": "b"}, "--record and --replay exclude each other"),
+        ({"save": Path("a.mp4")}, r"a\.mp4 has the suffix '\.mp4', but it must be one of \.png"),
     ],
 )
 def test_bad_options(options, match):
@@ -262,6 +242,19 @@ def test_a_replay_with_a_model_of_the_library(tmp_path, capsys):
     assert "predictions in 6" in printed.err
     assert "contact, topples 0." in printed.out
     assert str(picture) in printed.out
-    assert cv2.imread(str(picture)).shape[1] == panel(seen()).shape[1]
+    height, width = panel(seen()).shape[:2]
+    written = cv2.imread(str(picture))
+    assert (written.shape[0] % height, written.shape[1]) == (0, width)
+    assert height < written.shape[0] <= 6 * height
     live.main(dataclasses.replace(config, save=None, loop=False, seconds=None, speed=20.0))
     assert "has ended after 40 images" in capsys.readouterr().err
+
+
+def test_silent_connections_are_closed(monkeypatch):
+    monkeypatch.setattr("experiments.shared.page._Handler.timeout", 0.05)
+    page = LivePage("127.0.0.1", 0, title="A twin")
+    try:
+        with socket.create_connection((page.host, page.port), timeout=WAIT_S) as connection:
+            assert connection.recv(1) == b""
+    finally:
+        page.close()

@@ -23,7 +23,7 @@ from benchmarks.instruments.camera_server import SIZE
 from benchmarks.instruments.sensor_peer import DARK, LIT, SensorPeer
 from experiments import real
 from experiments.shared.collecting import person
-from experiments.shared.page import Page
+from experiments.shared.page import CollectPage
 from experiments.shared.terminal import Terminal, single_keys
 from sts_jax import hardware
 from sts_jax.hardware import Action, Stage
@@ -159,7 +159,7 @@ def view(stage=Stage.REVIEW, number=0, **changes):
 
 @pytest.fixture
 def page():
-    made = Page("127.0.0.1", 0, count=5)
+    made = CollectPage("127.0.0.1", 0, count=5)
     yield made
     made.close()
 
@@ -221,11 +221,11 @@ def test_other_sites_can_neither_see_nor_press(page):
 
 def test_an_address_in_use_is_named(page):
     with pytest.raises(OSError, match=rf"cannot be served at 127.0.0.1:{page.port} .*give another --host or --port"):
-        Page("127.0.0.1", page.port)
+        CollectPage("127.0.0.1", page.port)
 
 
 def test_the_page_states_where_it_listens(capsys):
-    for host, text in (("127.0.0.1", "only this computer can open it"), ("0.0.0.0", "EVERY computer")):
+    for host, text in (("127.0.0.1", "only this computer can watch and press"), ("0.0.0.0", "EVERY computer")):
         with person(real.Collect(host=host, port=0)):
             pass
         assert f"listens on {host}, so {text}" in capsys.readouterr().err

@@ -23,7 +23,7 @@ import tyro
 from led_simulator import until
 
 import sts_jax as sts
-from experiments.shared import twin_device
+from experiments.shared.device import TwinConfig, make_twin
 from sts_jax import hardware
 from sts_jax.hardware import Lens, protocol, twin
 from sts_jax.hardware.twin import photometry
@@ -493,13 +493,13 @@ def test_wrong_baud_rate_is_recognised(served):
 
 def test_command_makes_the_twin_of_its_options():
     config = tyro.cli(
-        twin_device.Config, args=["--resolution", "24", "32", "--imperfections.lag-s", "0.1", "--field-of-view", "None"]
+        TwinConfig, args=["--resolution", "24", "32", "--imperfections.lag-s", "0.1", "--field-of-view", "None"]
     )
-    with twin_device.make(config) as device:
+    with make_twin(config) as device:
         assert device.imperfections.lag_s == 0.1
         assert device.capture()[1].shape == (24, 32, 3)
     with pytest.raises(ValueError, match="must be one of"):
-        twin_device.make(dataclasses.replace(config, object_class="unicorn"))
+        make_twin(dataclasses.replace(config, object_class="unicorn"))
 
 
 @pytest.mark.slow

@@ -1,16 +1,23 @@
-"""The sub-command `collect` of `experiments.real`: guide a person through trajectories, and save the trajectories."""
+"""`collect` and `review` of `experiments.real`: record trajectories with a person, and list, correct and draw them."""
 
 import contextlib
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
-from experiments.shared import simulated
-from experiments.shared.page import Page
+import cv2
+from PIL import Image, ImageDraw, ImageFont
+
+from experiments.shared import drawing
+from experiments.shared.device import Simulated, simulate
+from experiments.shared.page import CollectPage
 from experiments.shared.run import Folder
 from experiments.shared.terminal import Terminal, say, single_keys
 from sts_jax import hardware, storage
 from sts_jax.hardware import AutomaticPerson, EmptyPad, GuideConfig, Person, View
+
+SHEET = 20  # number of trajectories, the newest ones, that `--sheet` draws by default
+PANEL = 200  # width of an image on the sheet (pixels)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,64 +55,27 @@ class Collect:
     debug: bool = False  # show the traceback of every error
 
 
-def device(config: Collect) -> tuple[hardware.STS, EmptyPad | None]:
-    """Make the sensor that the options describe.
+@dataclasses.dataclass(frozen=True)
+class Review:
+    """List, discard, restore or confirm trajectories, check their files, or draw their images."""
 
-    Returns:
-        The sensor, which is not connected yet, and the appearance of the empty pad. The appearance is computed from the
-        background images of the sensor file, and is None if there are no background images.
-
-    Raises:
-        ValueError: An option is missing or out of range, or contradicts the sensor file.
-        SensorFileError: The sensor file is damaged, or belongs to another camera.
-        OSError: The sensor file does not exist.
-    """
-    if config.count is not None and config.count < 1:
-        raise ValueError(f"--count must be >= 1, got {config.count}")
-    if config.sensor is not None:
-        return commissioned(config, config.sensor)
-    if config.camera is None or config.leds is None:
-        cameras, ports = hardware.find_sensors()
-        raise ValueError(
-            f"{'--camera' if config.camera is None else '--leds'} is missing. Cameras found: "
-            f"{', '.join(str(camera) for camera in cameras) or 'none'}. Serial ports found: "
-            f"{', '.join(port.device for port in ports) or 'none'}. Give --camera and --leds, "
-            "or a sensor file with --sensor"
-        )
-    width, height = config.size or (1640, 1232)
-    camera = hardware.CameraConfig(config.camera, width, height, fourcc=config.fourcc, lock=config.lock)
-    return hardware.STS(camera=camera, leds=config.leds, levels=config.levels or (255, 255, 255, 255)), None
-
-
-def commissioned(config: Collect, file: Path) -> tuple[hardware.STS, EmptyPad | None]:
-    """Make the sensor that a sensor file describes. See the function `device` for the return values and exceptions."""
-    for name, value in (("size", config.size), ("levels", config.levels)):
-        if value is not None:
-            raise ValueError(
-                f"--{name} is {value}, but the sensor file {file} determines this value: leave out --{name} or --sensor"
-            )
-    device = hardware.Device.load(file)
-    camera = device.camera_config(config.camera)
-    camera = dataclasses.replace(camera, lock=config.lock and camera.lock, fourcc=config.fourcc or camera.fourcc)
-    backgrounds = device.backgrounds(file)
-    empty = None if backgrounds is None else hardware.known_pad(*backgrounds)
-    return hardware.STS.from_file(file, camera=camera, leds=config.leds), empty
+    workdir: Folder = Path("runs/real")  # work directory. The trajectories are in its folder `dataset`
+    discard: tuple[int, ...] = ()  # numbers of trajectories to move to the folder `discarded`
+    restore: tuple[int, ...] = ()  # numbers of discarded trajectories to move back
+    # numbers of trajectories to confirm. They have both pairs of images, but the session was interrupted before they
+    # were confirmed
+    confirm: tuple[int, ...] = ()
+    note: str = ""  # text that is stored with the trajectories of --confirm
+    check: bool = False  # read all images, and compare their checksums
+    sheet: Path | None = None  # draw the newest confirmed trajectories into this picture
+    numbers: tuple[int, ...] = ()  # numbers of trajectories that --sheet draws instead
+    debug: bool = False  # show the traceback of every error
 
 
 def collect(config: Collect) -> None:
-    """Connect the sensor, guide a person through trajectories, and save the trajectories.
-
-    The collection ends when there are enough trajectories or the user stops the command.
-
-    Raises:
-        ValueError: An option is missing or out of range, or contradicts a file in the work directory. Or a sensor file
-            is damaged.
-        LockedError: Another process collects into the work directory.
-        OSError: A file cannot be read or written, or a recorded trajectory is damaged.
-        LedError, CameraError, LightError, NoContrastError: The sensor cannot be connected or read.
-    """
+    """Connect the sensor, and save trajectories until there are enough of them or the user stops the command."""
     if config.twin:
-        simulated.collect(of_twin(config))
+        simulate(of_twin(config))
         return
     sensor, empty = device(config)
     with person(config) as someone:
@@ -138,45 +108,55 @@ def collect(config: Collect) -> None:
             )
 
 
-def of_twin(config: Collect) -> simulated.Simulated:
-    """Convert the options of `collect` to the options of a collection with the digital twin.
-
-    Raises:
-        ValueError: An option is out of range, or an option for a real device is given.
-    """
-    devices = {"camera": config.camera, "leds": config.leds, "sensor": config.sensor, "fourcc": config.fourcc}
-    for name, value in devices.items():
+def of_twin(config: Collect) -> Simulated:
+    """Convert the options of `collect` to those of a collection with the twin, and refuse options for devices."""
+    for name in ("camera", "leds", "sensor", "fourcc"):
+        value = getattr(config, name)
         if value is not None:
             raise ValueError(f"--{name} is {value}, but no device is used with --twin: leave out --{name} or --twin")
     if not config.lock:
         raise ValueError("--no-lock has no effect on the digital twin (--twin): leave out --no-lock or --twin")
-    default = simulated.Simulated(config.workdir)
-    return simulated.Simulated(
-        config.workdir,
-        count=default.count if config.count is None else config.count,
-        size=default.size if config.size is None else config.size,
-        levels=default.levels if config.levels is None else config.levels,
-        seed=config.seed,
-        note=config.note,
-        guide=config.guide,
-    )
+    given = {name: getattr(config, name) for name in ("count", "size", "levels")}
+    options = {name: value for name, value in given.items() if value is not None}
+    return Simulated(config.workdir, seed=config.seed, note=config.note, guide=config.guide, **options)
+
+
+def device(config: Collect) -> tuple[hardware.STS, EmptyPad | None]:
+    """Make the sensor that the options describe, not yet connected, and the look of its empty pad, if it is known."""
+    if config.count is not None and config.count < 1:
+        raise ValueError(f"--count must be >= 1, got {config.count}")
+    if config.sensor is not None:
+        return commissioned(config, config.sensor)
+    if config.camera is None or config.leds is None:
+        cameras, ports = hardware.find_sensors()
+        raise ValueError(
+            f"{'--camera' if config.camera is None else '--leds'} is missing. Cameras found: "
+            f"{', '.join(str(camera) for camera in cameras) or 'none'}. Serial ports found: "
+            f"{', '.join(port.device for port in ports) or 'none'}. Give --camera and --leds, "
+            "or a sensor file with --sensor"
+        )
+    width, height = config.size or (1640, 1232)
+    camera = hardware.CameraConfig(config.camera, width, height, fourcc=config.fourcc, lock=config.lock)
+    return hardware.STS(camera=camera, leds=config.leds, levels=config.levels or (255, 255, 255, 255)), None
+
+
+def commissioned(config: Collect, file: Path) -> tuple[hardware.STS, EmptyPad | None]:
+    """Make the sensor of a sensor file."""
+    for name, value in (("size", config.size), ("levels", config.levels)):
+        if value is not None:
+            raise ValueError(
+                f"--{name} is {value}, but the sensor file {file} determines this value: leave out --{name} or --sensor"
+            )
+    device = hardware.Device.load(file)
+    camera = device.camera_config(config.camera)
+    camera = dataclasses.replace(camera, lock=config.lock and camera.lock, fourcc=config.fourcc or camera.fourcc)
+    backgrounds = device.backgrounds(file)
+    empty = None if backgrounds is None else hardware.known_pad(*backgrounds)
+    return hardware.STS.from_file(file, camera=camera, leds=config.leds), empty
 
 
 def keep(file: Path, workdir: Path) -> None:
-    """Copy a sensor file and its backgrounds into a work directory.
-
-    If the work directory already contains a sensor file, nothing is copied, and both sensor files must have the same
-    content.
-
-    Args:
-        file: Path of the sensor file or of its folder.
-        workdir: Work directory.
-
-    Raises:
-        ValueError: The work directory already contains a sensor file with another content.
-        SensorFileError: A sensor file or a background image is damaged.
-        OSError: The sensor file does not exist, or a file cannot be written.
-    """
+    """Copy a sensor file and its backgrounds into a work directory, or check that it has the same file already."""
     checksums = hardware.sensor_file.checksums
     if not (workdir / storage.MANIFEST).exists():  # the manifest is the last file of a copy
         hardware.copy_sensor(file, workdir)
@@ -189,62 +169,101 @@ def keep(file: Path, workdir: Path) -> None:
 
 @contextlib.contextmanager
 def person(config: Collect) -> Iterator[Person]:
-    """Make the page or terminal that shows instructions to a person and receives the person's actions.
-
-    The page is closed at the end of the `with` block.
-
-    Raises:
-        OSError: The address of the page cannot be used.
-        ValueError: The terminal cannot be read key by key.
-    """
+    """The terminal or the page that shows instructions to a person and receives the person's actions."""
     if config.headless:
         with single_keys():
-            yield AutomaticTerminal(config.count) if config.automatic else Terminal(config.count)
+            terminal = Terminal(config.count, keys=not config.automatic)
+            yield Automatic(terminal, actions=False) if config.automatic else terminal
         return
-    page = Page(config.host, config.port, count=config.count)
-    reach = "only this computer can open it"
-    if not page.is_local:
-        reach = "EVERY computer that reaches this address can watch and press the buttons"
-    say(f"open {page.url} in a browser. The page listens on {config.host}, so {reach}")
-    try:
-        yield AutomaticPage(page) if config.automatic else page
-    finally:
-        page.close()
+    with contextlib.closing(CollectPage(config.host, config.port, count=config.count)) as page:
+        page.announce("watch and press the buttons")
+        yield Automatic(page, actions=True) if config.automatic else page
 
 
-class AutomaticTerminal(AutomaticPerson):
-    """A `Person` that confirms every trajectory automatically and prints the instructions in the terminal."""
+class Automatic(AutomaticPerson):
+    """Shows the views of another person, and confirms every trajectory. The other person can still act, if asked."""
 
-    def __init__(self, count: int | None):
+    def __init__(self, other: Person, *, actions: bool):
         super().__init__()
-        self._terminal = Terminal(count, keys=False)
+        self._other, self._actions = other, actions
 
     def show(self, view: View) -> None:
-        """Print `view.problem`, or `view.instruction` if there is no problem.
-
-        Nothing is printed if the instruction, the problem and the number of the trajectory are the same as in the
-        previous call.
-        """
+        """Show a view to both."""
         super().show(view)
-        self._terminal.show(view)
-
-
-class AutomaticPage(AutomaticPerson):
-    """The page for a collection in which every trajectory is confirmed automatically. Its buttons can still be used."""
-
-    def __init__(self, page: Page):
-        super().__init__()
-        self._page = page
-
-    def show(self, view: View) -> None:
-        """Update all open pages with the images and the instruction in `view`."""
-        super().show(view)
-        self._page.show(view)
+        self._other.show(view)
 
     def action(self) -> hardware.Action | None:
-        """Return the action of the button that was pressed last, or the automatic action if no button was pressed.
+        """The action of the other person, or the automatic one."""
+        return (self._other.action() if self._actions else None) or super().action()
 
-        The automatic action is `Action.CONFIRM` in the stage `REVIEW`, in which a recorded trajectory is confirmed or
-        discarded. In all other stages, it is None.
-        """
-        return self._page.action() or super().action()
+
+def review(config: Review) -> None:
+    """Confirm, discard or restore trajectories, check files, draw images, or list trajectories."""
+    folder = config.workdir / "dataset"
+    if config.sheet is not None:
+        drawing.check_picture(config.sheet)
+    for number in config.restore:
+        hardware.restore_recording(folder, number)
+    for number in config.confirm:
+        hardware.confirm_recording(folder, number, config.note)
+    for number in config.discard:
+        hardware.discard_recording(folder, number)
+    if config.check:
+        check(folder)
+    if config.sheet is not None:
+        draw(folder, config.numbers, config.sheet)
+        print(config.sheet)
+    if config.check or config.sheet is not None:
+        return
+    entries = hardware.list_recordings(folder)
+    for entry in entries:
+        print(f"{entry.number:5d}  {entry.standing:11s}  {entry.taken or '-':29s}  {entry.note}".rstrip())
+    print(f"{sum(entry.standing == 'confirmed' for entry in entries)} confirmed of {len(entries)} in {folder}")
+
+
+def check(folder: Path) -> None:
+    """Read all confirmed trajectories, and end with code 1 if one is damaged."""
+    recordings, damaged = hardware.load_recordings(folder), 0
+    for index in range(len(recordings)):
+        try:
+            recordings[index]
+        except OSError as error:
+            say(str(error))
+            damaged += 1
+    print(f"{len(recordings) - damaged} of {len(recordings)} confirmed trajectories are undamaged in {folder}")
+    if damaged:
+        raise SystemExit(1)
+
+
+def draw(folder: Path, numbers: tuple[int, ...], path: Path) -> None:
+    """Draw trajectories as rows of four images: initial visual and tactile, final visual and tactile.
+
+    Args:
+        folder: Folder of the session.
+        numbers: Numbers of the trajectories. Empty: the newest `SHEET`.
+        path: Path of the picture.
+    """
+    recordings = hardware.load_recordings(folder)
+    if unknown := set(numbers) - set(recordings.numbers):
+        raise ValueError(
+            f"{folder} has no confirmed trajectories with the numbers {sorted(unknown)}: give other --numbers"
+        )
+    if not recordings.numbers:
+        raise ValueError(f"no picture can be drawn, because {folder} has no confirmed trajectory: collect some first")
+    chosen = numbers or recordings.numbers[-SHEET:]
+    rows = []
+    for number in chosen:
+        trajectory = recordings[recordings.numbers.index(number)]
+        shots = [shot for pair in (trajectory.initial, trajectory.final) for shot in (pair.visual, pair.tactile)]
+        height = round(PANEL * shots[0].image.shape[0] / shots[0].image.shape[1])
+        rows.append([cv2.resize(shot.image, (PANEL, height), interpolation=cv2.INTER_AREA) for shot in shots])
+    height, margin, head = rows[0][0].shape[0], 60, 24
+    sheet = Image.new("RGB", (margin + 4 * (PANEL + 4), head + len(rows) * (height + 4)), "white")
+    pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=14)
+    for column, title in enumerate(("initial, visual", "initial, tactile", "final, visual", "final, tactile")):
+        pen.text((margin + column * (PANEL + 4), 4), title, fill="black", font=font)
+    for row, (number, images) in enumerate(zip(chosen, rows, strict=True)):
+        pen.text((6, head + row * (height + 4) + height // 2 - 8), str(number), fill="black", font=font)
+        for column, image in enumerate(images):
+            sheet.paste(Image.fromarray(image), (margin + column * (PANEL + 4), head + row * (height + 4)))
+    drawing.write_picture(path, sheet)

@@ -1,4 +1,7 @@
-"""A thread that predicts images of the resting object from live images. A slow model skips some live images."""
+"""Predicts images of the resting object from live images in a thread, and draws what a live display shows.
+
+Live images that arrive while the model is busy are skipped, and never queued.
+"""
 
 import collections
 import dataclasses
@@ -13,6 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, UInt8
+from PIL import Image as Pictures
+from PIL import ImageDraw, ImageFont
 
 import sts_jax as sts
 from sts_jax import hardware
@@ -24,12 +29,19 @@ _KEPT = 4096  # number of latencies from which the median is computed
 _OCCUPIED = 8.0  # difference of a block of the visual image from the empty pad that counts as a change, of 255
 _BLOCKS = 3  # number of changed blocks that show an object
 
+_SMALL = 240  # side of an image in a panel (pixels)
+_GAP = 8  # distance between two images (pixels)
+_HEAD = 24  # height of the titles (pixels)
+_TEXT = 220  # width of the text (pixels)
+_TITLES = ("visual, now", "tactile, now", "visual, predicted at rest", "tactile, predicted at rest")
+_BAR = "#3f51b5"
+
 Image = UInt8[np.ndarray, "height width 3"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Predicted:
-    """A prediction of the resting state, and facts about the input images, such as whether they show a contact."""
+    """A prediction of the resting state, and facts about the input images."""
 
     visual: Image  # predicted visual image at rest, the mean over the model's samples
     tactile: Image  # predicted tactile image at rest
@@ -54,65 +66,34 @@ class Seen(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Backgrounds:
-    """The raw images of the empty pad."""
-
-    visual: Image  # raw image without light
-    tactile: Image  # raw image with light
-    divided: bool  # True if the images for the model are divided by the images of the empty pad
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
 class Views:
-    """The conversion from raw images to rectified images, which show the view of the sensor's pinhole camera."""
+    """The conversion from raw images to the view of the sensor."""
 
     lens: hardware.Lens  # lens of the raw images
     pinhole: sts.optics.Camera  # view of the sensor
-    backgrounds: Backgrounds | None  # images of the empty pad, if they are known
+    empty: tuple[Image, Image] | None  # raw visual and tactile image of the empty pad, if they are known
+    divided: bool = True  # divide the images for the model by the images of the empty pad
 
     def shown(self, image: Image) -> Image:
-        """Rectify a raw image for display, and crop it to the sensor's pad.
-
-        Args:
-            image: Raw image, uint8 RGB.
-
-        Returns:
-            Rectified image, uint8 RGB of shape (SIDE, SIDE, 3).
-        """
+        """Rectify a raw image for display, to (SIDE, SIDE, 3)."""
         return hardware.rectified(self.lens, self.pinhole, image, (SIDE, SIDE))
 
-    def floats(self, image: Image, resolution: tuple[int, int]) -> Float[np.ndarray, "height width 3"]:
-        """Rectify a raw image, and crop it to the sensor's pad.
-
-        Args:
-            image: Raw image, uint8 RGB.
-            resolution: Height and width of the result (pixels).
-
-        Returns:
-            Rectified image, float32 RGB in [0, 1].
-        """
-        return hardware.rectified(self.lens, self.pinhole, image, resolution).astype(np.float32) / 255
+    def rectified(self, images: tuple[Image, Image], size: tuple[int, int]) -> hardware.SensorView:
+        """Rectify a raw visual and a raw tactile image, to float32 RGB in [0, 1]."""
+        rectified = (hardware.rectified(self.lens, self.pinhole, image, size) for image in images)
+        return hardware.SensorView(*(image.astype(np.float32) / 255 for image in rectified))
 
     def prepared(self, visual: Image, tactile: Image, empty: Mapping[str, np.ndarray]) -> hardware.SensorView:
-        """Convert raw images to the inputs of a model.
+        """Convert raw images to the inputs of a model whose empty sensor looks like `empty` (`Predictor.empty`).
 
-        If `self.backgrounds` is not None and `self.backgrounds.divided` is True, `hardware.relit` adapts the brightness
-        and the colours of the images to the sensor on which the model was trained.
-
-        Args:
-            visual: Raw visual image.
-            tactile: Raw tactile image.
-            empty: Images of the empty pad of the sensor on which the model was trained (`Predictor.empty`). The result
-                has the same resolution as these images.
+        Unless `divided` is False, `hardware.relit` adapts brightness and colours to the sensor of the model's training.
         """
         model = hardware.SensorView(**empty)
         rows, columns = model.visual.shape[:2]
-        size, empty_pad = (rows, columns), self.backgrounds
-        view = hardware.SensorView(self.floats(visual, size), self.floats(tactile, size))
-        if empty_pad is None or not empty_pad.divided:
+        view = self.rectified((visual, tactile), (rows, columns))
+        if self.empty is None or not self.divided:
             return view
-        background = hardware.SensorView(self.floats(empty_pad.visual, size), self.floats(empty_pad.tactile, size))
-        return hardware.relit(view, background, model)
+        return hardware.relit(view, self.rectified(self.empty, (rows, columns)), model)
 
 
 class Live:
@@ -132,19 +113,13 @@ class Live:
         condition: tuple[float, ...],
         show: Callable[[], None],
     ):
-        """Compile the model, and start the thread.
-
-        The first compilation on a machine takes about half a minute.
+        """Compile the model, which takes about half a minute the first time on a machine, and start the thread.
 
         Args:
-            predictor: Trained model. Visual images must be among its inputs.
+            predictor: Trained model with visual images among its inputs.
             views: Conversion from raw images to the view of the sensor.
-            condition: Known quantities of the scenario that the model receives (SI units). An empty tuple stands for
-                zeros.
+            condition: Condition of the model (SI units). Empty: zeros.
             show: Function that the thread calls after each prediction. The latency includes this call.
-
-        Raises:
-            ValueError: The model cannot use visual images, or `condition` has the wrong length.
         """
         if "visual" not in predictor.modalities:
             raise ValueError(
@@ -159,10 +134,9 @@ class Live:
         self._predictor, self._views = predictor, views
         self._condition = np.asarray(condition or (0.0,) * width, np.float32) if width else None
         self._show = show
-        self._streams = tuple(name for name in ("visual", "tactile") if name in predictor.modalities)
         self._untouched = predictor.empty
-        empty = views.backgrounds
-        self._empty = None if empty is None else hardware.known_pad(empty.visual, empty.tactile)
+        self._touches = "tactile" in predictor.modalities
+        self._empty = None if views.empty is None else hardware.known_pad(*views.empty)
         self.offered = self.made = 0
         self._latencies_s: collections.deque[float] = collections.deque(maxlen=_KEPT)
         self._shown_s: collections.deque[float] = collections.deque(maxlen=_KEPT)
@@ -176,14 +150,9 @@ class Live:
         self._thread.start()
 
     def offer(self, visual: hardware.Shot, tactile: hardware.Shot) -> None:
-        """Pass new images to the prediction thread. They replace earlier images that the thread has not used yet.
+        """Pass the newest images to the thread, in place of images that it has not used yet.
 
-        Args:
-            visual: Newest visual image.
-            tactile: Newest tactile image.
-
-        Raises:
-            Exception: An earlier prediction raised this exception, which ended the thread.
+        An error of an earlier prediction, which ended the thread, is raised here.
         """
         with self._changed:
             if self._error is not None:
@@ -208,15 +177,12 @@ class Live:
 
     @property
     def latency_s(self) -> float | None:
-        """Median latency of the predictions (s), or None before the first prediction.
-
-        The latency is the time from the arrival of the newer of the two input images until the prediction is shown.
-        """
+        """Median time from the arrival of a prediction's newer input until it is shown (s), or None at first."""
         with self._changed:
             return statistics.median(self._latencies_s) if self._latencies_s else None
 
     def close(self) -> None:
-        """Stop the prediction thread."""
+        """Stop the thread."""
         with self._changed:
             self._stopped = True
             self._changed.notify_all()
@@ -255,12 +221,12 @@ class Live:
         """Predict from raw images."""
         contact, occupied = self._contact(visual, tactile)
         view = self._views.prepared(visual.image, tactile.image, self._untouched)
-        found = self._compute(view._asdict(), contact=contact is not False)
-        chances = [] if found.outcome_probability is None else np.asarray(found.outcome_probability).tolist()
+        out = self._compute(view._asdict(), contact=contact is not False)
+        chances = [] if out.outcome_probability is None else np.asarray(out.outcome_probability).tolist()
         names = self._predictor.outcomes or tuple(f"outcome {number}" for number in range(len(chances)))
         return Predicted(
-            _shown(found.visual),
-            _shown(found.tactile),
+            _shown(out.visual),
+            _shown(out.tactile),
             list(zip(names, chances, strict=True)),
             contact,
             occupied,
@@ -269,10 +235,10 @@ class Live:
 
     def _compute(self, views: Mapping[str, np.ndarray], *, contact: bool) -> sts.Prediction:
         """Predict from images in the view of the sensor. The tactile image is ignored unless `contact` is True."""
-        touch = views["tactile"] if "tactile" in self._streams else None
+        touch = views["tactile"] if self._touches else None
         present: dict[str, ArrayLike] | None = None if touch is None else {"tactile": np.bool_(contact)}
-        found = self._predictor(visual=views["visual"], tactile=touch, condition=self._condition, present=present)
-        return jax.block_until_ready(found)
+        out = self._predictor(visual=views["visual"], tactile=touch, condition=self._condition, present=present)
+        return jax.block_until_ready(out)
 
     def _contact(self, visual: hardware.Shot, tactile: hardware.Shot) -> tuple[bool | None, bool | None]:
         """Return whether the object touches the pad, and whether one of the images shows an object."""
@@ -288,3 +254,36 @@ def _shown(image: Float[Array, "height width 3"] | None) -> Image:
     """Convert a predicted image in [0, 1] to uint8 in the size for display. None becomes a black image."""
     pixels = np.zeros((1, 1, 3)) if image is None else np.asarray(jnp.clip(image, 0, 1))
     return cv2.resize(np.round(255 * pixels).astype(np.uint8), (SIDE, SIDE), interpolation=cv2.INTER_CUBIC)
+
+
+def lines(seen: Seen) -> list[str]:
+    """The prediction rate, the latency, the contact state and the remark on the image source, as lines of text."""
+    predicted = seen.predicted
+    latency = "" if seen.latency_s is None else f"latency {1000 * seen.latency_s:.0f} ms"
+    touch = "contact unknown"
+    if predicted is not None and predicted.contact is not None:
+        touch = "contact" if predicted.contact else "no contact" if predicted.occupied else "nothing on the pad"
+    return [line for line in (f"{seen.rate:.1f} predictions/s", latency, touch, *seen.note.split(", ")) if line]
+
+
+def panel(seen: Seen) -> Image:
+    """Draw the live and the predicted images, the outcome probabilities, the rate and the latency in one row."""
+    predicted = seen.predicted
+    images = [seen.visual, seen.tactile, *([] if predicted is None else [predicted.visual, predicted.tactile])]
+    sheet = Pictures.new("RGB", (4 * (_SMALL + _GAP) + _TEXT, _HEAD + _SMALL + _GAP), "white")
+    pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=14)
+    for column, (title, image) in enumerate(zip(_TITLES, images, strict=False)):
+        left = column * (_SMALL + _GAP)
+        pen.text((left + 2, 3), title, fill="black", font=font)
+        small = cv2.resize(image, (_SMALL, _SMALL), interpolation=cv2.INTER_AREA)
+        sheet.paste(Pictures.fromarray(small), (left, _HEAD))
+    left, top = 4 * (_SMALL + _GAP), _HEAD
+    for line in lines(seen):
+        pen.text((left, top), line, fill="black", font=font)
+        top += 20
+    for name, chance in [] if predicted is None else predicted.outcomes:
+        pen.text((left, top + 4), f"{name}  {chance:.0%}", fill="black", font=font)
+        pen.rectangle((left, top + 24, left + 200, top + 32), outline="#bbb")
+        pen.rectangle((left, top + 24, left + round(200 * chance), top + 32), fill=_BAR)
+        top += 36
+    return np.asarray(sheet)

@@ -1,43 +1,233 @@
-"""The browser page of `experiments.real collect`, with both live streams, the current instruction and buttons."""
+"""The browser pages of `experiments.real collect` and `experiments.live`, and the small web server of both.
 
+The server refuses requests for another host name, and actions without the HTTP header that the page sends. Another site
+in the same browser can therefore neither see the images nor press the buttons.
+"""
+
+import abc
+import contextlib
+import http.server
+import ipaddress
+import json
+import threading
 import time
+import urllib.parse
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
-from experiments.shared.site import Image, Site
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from experiments.shared.live import Seen
+from experiments.shared.terminal import say
 from sts_jax.hardware import Action, View
 
-_PAGE = Path(__file__).with_name("page.html")
-_STREAMS = ("visual", "tactile")
+_WIDEST = 820  # largest width of the images in the page (pixels)
+_QUALITY = 80  # JPEG quality
+_INTERVAL_S = 0.1  # time between two images of a stream (s)
+_OPEN_S = 2.0  # time since the last request for facts after which the page counts as closed (s)
+_LAST_S = 0.4  # time at the end in which open pages can request the last facts (s)
+_SILENT_S = 10.0  # time after which a connection that sends or takes nothing is closed (s)
+_LARGEST = 1000  # largest size of a request's content (bytes)
+
+Image = UInt8[np.ndarray, "height width 3"]
+State = TypeVar("State")  # what a page shows
 
 
-class Page(Site):
-    """A browser page that implements `hardware.Person`.
+class Page(abc.ABC, Generic[State]):
+    """A web server with one page, which shows the newest state."""
 
-    The page shows each `hardware.View` that it receives, and returns the actions of the person who uses the browser.
-    """
+    document: Path  # HTML file of the page
+    streams: tuple[str, ...]  # names of the live images. The page loads each from `NAME.mjpg`
+
+    def __init__(self, host: str, port: int):
+        """Start the server in a thread. Port 0 selects a free one."""
+        self._changed = threading.Condition()
+        self._state: State | None = None
+        self._number = 0  # number of changes of the state so far
+        self._ended = False
+        self._asked_s = -float("inf")  # time of the last request for facts, on the clock `time.monotonic` (s)
+        handler = type("Handler", (_Handler,), {"page": self})
+        try:
+            self._server = http.server.ThreadingHTTPServer((host, port), handler)
+        except (OSError, OverflowError) as error:
+            raise OSError(
+                f"the page cannot be served at {host}:{port} ({error}): give another --host or --port, or --headless"
+            ) from error
+        self._server.daemon_threads = True
+        self.host, self.port = host, self._server.server_port
+        self._thread = threading.Thread(target=self._server.serve_forever, name="page", daemon=True)
+        self._thread.start()
+
+    @abc.abstractmethod
+    def facts(self, state: State | None) -> dict[str, Any]:
+        """The content of the page without the images, as a dictionary of JSON values."""
+
+    @abc.abstractmethod
+    def image(self, state: State, path: str) -> Image | None:
+        """The image of a state at a path without suffix, such as `visual`, or None if it has no such image."""
+
+    def pressed(self, state: State | None, content: Any) -> bool:
+        """Accept an action of the page, such as a pressed button, or return False."""
+        return False
+
+    def show(self, state: State) -> None:
+        """Update the images and all other values in all open pages."""
+        with self._changed:
+            self._state, self._number = state, self._number + 1
+            self._changed.notify_all()
+
+    def announce(self, what: str) -> None:
+        """Print the address of the page, and who can do there `what`, such as "watch"."""
+        reach = "only this computer" if self.is_local else "EVERY computer that reaches this address"
+        say(f"open {self.url} in a browser. The page listens on {self.host}, so {reach} can {what}")
+
+    @property
+    def url(self) -> str:
+        """The address of the page."""
+        return f"http://{self.host}:{self.port}/"
+
+    @property
+    def is_local(self) -> bool:
+        """True if only programs on this computer can reach the page."""
+        with contextlib.suppress(ValueError):
+            return ipaddress.ip_address(self.host).is_loopback
+        return self.host == "localhost"
+
+    def newest(self) -> State | None:
+        """The newest state, or None before the first one."""
+        with self._changed:
+            return self._state
+
+    def answer(self) -> dict[str, Any]:
+        """The facts and whether the program has ended. The page then counts as open."""
+        self._asked_s = time.monotonic()
+        return {**self.facts(self.newest()), "ended": self._ended}
+
+    def wait(self, last: int) -> int | None:
+        """Wait until there were more than `last` changes. Returns their number, or None if the program has ended."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._ended or self._number > last)
+            return None if self._ended else self._number
+
+    def close(self) -> None:
+        """Show in open pages that the program has ended, and stop the server."""
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
+        if time.monotonic() - self._asked_s < _OPEN_S:
+            time.sleep(_LAST_S)
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+
+class _Handler(http.server.BaseHTTPRequestHandler):
+    """Answers the requests of the page."""
+
+    page: Page
+    timeout = _SILENT_S
+
+    def log_message(self, *_: object) -> None:
+        """Do not log requests."""
+
+    def do_GET(self) -> None:
+        """Send the HTML page, its facts, an image or a stream."""
+        path = self.path.partition("?")[0].removeprefix("/")
+        name, _, kind = path.rpartition(".")
+        with contextlib.suppress(OSError):  # the browser may have closed the connection
+            if not self._is_own_name():
+                self.send_error(403, "Open the page at the address that the program has printed")
+            elif path == "":
+                self._send("text/html; charset=utf-8", self.page.document.read_bytes())
+            elif path == "view":
+                self._send("application/json", json.dumps(self.page.answer()).encode())
+            elif kind == "mjpg" and name in self.page.streams:
+                self._stream(name)
+            elif kind == "jpg" and (image := self._image(name)) is not None:
+                self._send("image/jpeg", _jpeg(image))
+            else:
+                self.send_error(404)
+
+    def do_POST(self) -> None:
+        """Pass an action of the page to `Page.pressed`."""
+        length = self.headers.get("Content-Length", "")
+        with contextlib.suppress(OSError):
+            if not self._is_own_name() or self.path != "/action" or self.headers.get("X-Collect") != "1":
+                self.send_error(403)
+                return
+            if not length.isdecimal() or int(length) > _LARGEST:
+                self.send_error(400)
+                return
+            try:
+                content = json.loads(self.rfile.read(int(length)))
+            except ValueError:
+                self.send_error(400)
+                return
+            self.send_response(204 if self.page.pressed(self.page.newest(), content) else 409)
+            self.end_headers()
+
+    def _is_own_name(self) -> bool:
+        """Return whether the request names this server as its host, and not another site."""
+        name, host = "", self.page.host
+        with contextlib.suppress(ValueError):
+            name = urllib.parse.urlsplit("//" + self.headers.get("Host", "")).hostname or ""
+        if name == host or (self.page.is_local and name in ("localhost", "127.0.0.1", "::1")):
+            return True
+        with contextlib.suppress(ValueError):  # a server on 0.0.0.0 has all addresses of this computer
+            return host in ("0.0.0.0", "::") and bool(ipaddress.ip_address(name))
+        return False
+
+    def _image(self, path: str) -> Image | None:
+        state = self.page.newest()
+        return None if state is None else self.page.image(state, path)
+
+    def _send(self, kind: str, data: bytes) -> None:
+        self.send_response(200)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(data)))
+        self.send_header("Cache-Control", "no-store")
+        self.send_header("X-Content-Type-Options", "nosniff")
+        self.end_headers()
+        self.wfile.write(data)
+
+    def _stream(self, stream: str) -> None:
+        self.send_response(200)
+        self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
+        self.send_header("Cache-Control", "no-store")
+        self.end_headers()
+        number, shown = 0, None
+        while (changed := self.page.wait(number)) is not None:
+            number, image = changed, self._image(stream)
+            if image is None or image is shown:
+                continue
+            shown, data = image, _jpeg(image)
+            head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
+            self.wfile.write(head.encode() + data + b"\r\n")
+            time.sleep(_INTERVAL_S)
+
+
+def _jpeg(image: Image) -> bytes:
+    """Reduce an image to at most `_WIDEST` pixels in width, and encode it as JPEG."""
+    height, width = image.shape[:2]
+    if width > _WIDEST:
+        image = cv2.resize(image, (_WIDEST, round(height * _WIDEST / width)), interpolation=cv2.INTER_AREA)
+    parameters = [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
+    return cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), parameters)[1].tobytes()
+
+
+class CollectPage(Page[View]):
+    """The page of `experiments.real collect`, a `hardware.Person`: both streams, the instruction, and buttons."""
+
+    document = Path(__file__).with_name("page.html")
+    streams = ("visual", "tactile")
 
     def __init__(self, host: str, port: int, *, count: int | None = None):
-        """Start the server of the page.
-
-        Args:
-            host: Address or name on which the server listens, such as 127.0.0.1.
-            port: TCP port. 0 selects a free one.
-            count: Number of trajectories that the page shows as the goal. None: no goal.
-
-        Raises:
-            OSError: The address cannot be used. The message names the address and the remedy.
-        """
+        """Start the server. `count` is the number of trajectories to reach, if there is one."""
         self._count = count
-        self._view: View | None = None
         self._action: Action | None = None
-        super().__init__(host, port, _PAGE, _STREAMS)
-
-    def show(self, view: View) -> None:
-        """Update all open pages with the images and the instruction in `view`."""
-        with self._changed:
-            self._view, self._number = view, self._number + 1
-            self._changed.notify_all()
+        super().__init__(host, port)
 
     def action(self) -> Action | None:
         """The action of the button that was pressed last, or None if no button was pressed since the last call."""
@@ -45,72 +235,73 @@ class Page(Site):
             action, self._action = self._action, None
             return action
 
-    def pressed(self, content: Any) -> bool:
-        """Accept the action of a button.
-
-        Args:
-            content: Decoded JSON with `action`, and with the `stage` and the `number` of the trajectory on the page.
-
-        Returns:
-            True if the action is accepted. An action is refused if the content is invalid, or if no view was shown yet.
-            It is also refused if the page showed an old stage or trajectory, unless the action is `stop`.
-        """
+    def pressed(self, state: View | None, content: Any) -> bool:
+        """Accept the action of a button, unless the page showed an old stage or trajectory. Stop always counts."""
+        try:
+            action, shown = Action(content["action"]), (content["stage"], content["number"])
+        except (KeyError, TypeError, ValueError):
+            return False
+        if state is None or (action is not Action.STOP and shown != (state.stage.value, state.number)):
+            return False
         with self._changed:
-            view = self._view
-            try:
-                action = Action(content["action"])
-                shown = content["stage"], content["number"]
-            except (KeyError, TypeError, ValueError):
-                return False
-            if view is None or (action is not Action.STOP and shown != (view.stage.value, view.number)):
-                return False
             self._action = action
-            return True
+        return True
 
-    def facts(self) -> dict[str, Any]:
-        """The values that the page shows besides the images, such as the instruction, as a dict for JSON."""
-        with self._changed:
-            view, ended = self._view, self._ended
-        if view is None:
-            return {
-                **{"stage": "", "instruction": "Connecting", "number": None, "confirmed": 0, "waiting": 0},
-                **{"contact": False, "still": False, "problem": None, "count": self._count, "ends": []},
-                **{"age_s": None, "ended": ended},
-            }
-        pair = view.pair
+    def facts(self, state: View | None) -> dict[str, Any]:
+        """The instruction and the state of the recording."""
+        if state is None:
+            nothing: dict[str, Any] = {"number": None, "contact": False, "still": False, "problem": None, "ends": []}
+            counts = {"confirmed": 0, "waiting": 0, "count": self._count}
+            return {"stage": "", "instruction": "Connecting", "age_s": None, **nothing, **counts}
+        pair = state.pair
+        names = ("instruction", "number", "confirmed", "waiting", "contact", "still", "problem")
         return {
-            "stage": view.stage.value,
-            "instruction": view.instruction,
-            "number": view.number,
-            "confirmed": view.confirmed,
-            "waiting": view.waiting,
-            "contact": view.contact,
-            "still": view.still,
-            "problem": view.problem,
+            **{name: getattr(state, name) for name in names},
+            "stage": state.stage.value,
             "count": self._count,
-            "ends": [end for end in ("initial", "final") if getattr(view, end) is not None],
+            "ends": [end for end in ("initial", "final") if getattr(state, end) is not None],
             "age_s": None if pair is None else time.monotonic() - max(pair.visual.time_s, pair.tactile.time_s),
-            "ended": ended,
         }
 
-    def image(self, stream: str) -> Image | None:
-        """The newest image of a stream (`visual` or `tactile`), or None before the first pair of images."""
-        with self._changed:
-            pair = None if self._view is None else self._view.pair
-        return None if pair is None else getattr(pair, stream).image
-
-    def still(self, path: str) -> Image | None:
-        """The image of the current trajectory at a URL path such as `end/initial/visual.jpg`.
-
-        The first part of the path is always `end`. The second part, `initial` or `final`, selects a pair of images. The
-        third part selects the visual or the tactile image of this pair.
-        The result is None if the image was not taken yet, or if the path has another form.
-        """
-        head, _, rest = path.partition("/")
-        end, _, name = rest.partition("/")
-        stream = name.removesuffix(".jpg")
-        if head != "end" or end not in ("initial", "final") or stream not in _STREAMS:
+    def image(self, state: View, path: str) -> Image | None:
+        """The newest image of a stream (`visual`), or an image of the current trajectory (`end/initial/visual`)."""
+        *ends, stream = path.split("/")
+        if stream not in self.streams or ends not in ([], ["end", "initial"], ["end", "final"]):
             return None
-        with self._changed:
-            pair = getattr(self._view, end, None)
+        pair = getattr(state, ends[1]) if ends else state.pair
         return None if pair is None else getattr(pair, stream).image
+
+
+class LivePage(Page[Seen]):
+    """The page of `experiments.live`: the live images, the predicted images, and facts about the predictions."""
+
+    document = Path(__file__).with_name("live_page.html")
+    streams = ("visual", "tactile", "predicted_visual", "predicted_tactile")
+
+    def __init__(self, host: str, port: int, *, title: str):
+        """Start the server. `title` names the source and the model."""
+        self._title = title
+        super().__init__(host, port)
+
+    def facts(self, state: Seen | None) -> dict[str, Any]:
+        """The rate, the latency, the contact and the outcomes."""
+        if state is None:
+            return {"title": self._title, "waiting": True}
+        predicted, names = state.predicted, ("note", "images_per_s", "recorded", "rate")
+        return {
+            **{name: getattr(state, name) for name in names},
+            "title": self._title,
+            "waiting": predicted is None,
+            "age_s": time.monotonic() - state.time_s,
+            "latency_ms": None if state.latency_s is None else 1000 * state.latency_s,
+            "contact": None if predicted is None else predicted.contact,
+            "occupied": None if predicted is None else predicted.occupied,
+            "outcomes": [] if predicted is None else predicted.outcomes,
+        }
+
+    def image(self, state: Seen, path: str) -> Image | None:
+        """The newest image of a stream such as `visual` or `predicted_visual`."""
+        if path not in self.streams:
+            return None
+        stream = path.removeprefix("predicted_")
+        return getattr(state if stream == path else state.predicted, stream, None)

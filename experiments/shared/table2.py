@@ -9,8 +9,8 @@ import numpy as np
 import tyro
 
 import sts_jax as sts
-from experiments.shared import simulated
 from experiments.shared.config import MODELS, TITLES
+from experiments.shared.device import Simulated, simulate
 from experiments.shared.evaluate import identity, record, stale
 from experiments.shared.run import Folder, Job, Stage, train_model
 from experiments.shared.terminal import Bar, say
@@ -85,7 +85,7 @@ def main(args: Train) -> None:
     sts.enable_compilation_cache()
     if args.only in (None, "collect") and (count := missing(config, workdir)):
         say(f"collect: {count} trajectories of the digital twin into {workdir / 'dataset'}")
-        simulated.collect(simulated.Simulated(workdir, config.count, config.size))
+        simulate(Simulated(workdir, config.count, config.size))
     if args.only == "collect":
         return
     data, folder = read(config, workdir), workdir / args.name
@@ -238,9 +238,9 @@ def evaluate(config: Config, data: Recorded, workdir: Path, folder: Path) -> str
     if metrics.exists():
         say(f"evaluate: again, because {reason}")
     predicted = predictions(models, data)
-    simulated_training = transferred(config, data, workdir)
-    if simulated_training is not None:
-        predicted[SIMULATED_TITLE] = simulated_training
+    transfer = transferred(config, data, workdir)
+    if transfer is not None:
+        predicted[SIMULATED_TITLE] = transfer
     baselines = evaluation.image_baselines(data.train, data.validation)
     summary = evaluation.image_summary({**baselines, **predicted}, data.validation)
     logs = {TITLES[name]: records.read(path / records.NAME) for name, path in models.items()}
