@@ -7,7 +7,8 @@ import pytest
 
 import sts_jax as sts
 from experiments import real
-from experiments.shared import collecting, device
+from experiments.shared import collecting
+from experiments.shared.device import Hand, Simulated, commissioned, simulate, started
 from sts_jax import hardware
 from sts_jax.hardware import twin
 
@@ -23,17 +24,17 @@ def ends(workdir):
 @pytest.mark.slow
 def test_an_interrupted_collection_of_the_twin_equals_an_uninterrupted_one(tmp_path, monkeypatch, capsys):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
-    device.simulate(device.Simulated(whole, 5, **SMALL))
-    show = device.Hand.show
+    simulate(Simulated(whole, 5, **SMALL))
+    show = Hand.show
 
     def interrupted(self, view):
         show(self, view)
         if view.confirmed == 2:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(device.Hand, "show", interrupted)
+    monkeypatch.setattr(Hand, "show", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        device.simulate(device.Simulated(parts, 5, **SMALL))
+        simulate(Simulated(parts, 5, **SMALL))
     monkeypatch.undo()
     kept = {path: path.read_bytes() for path in parts.rglob("*.png")}
     real.main(real.Collect(parts, twin=True, count=5, **SMALL))
@@ -60,9 +61,9 @@ def test_an_interrupted_collection_of_the_twin_equals_an_uninterrupted_one(tmp_p
 
 @pytest.mark.slow
 def test_the_sensor_file_of_the_twin_rectifies_to_the_simulated_view(tmp_path):
-    config = device.Simulated(tmp_path, 1, size=(320, 240))
-    with device.started(config, 0) as device:
-        sensor, empty = device.commissioned(config, device)
+    config = Simulated(tmp_path, 1, size=(320, 240))
+    with started(config, 0) as device:
+        sensor, empty = commissioned(config, device)
         pair = sensor.read()
         device.command("hold")
         held, pose = sensor.read(), device.state.pose
@@ -149,4 +150,4 @@ def test_a_work_directory_of_a_device_is_not_continued_by_the_twin(file, tmp_pat
         twin.Twin(twin.Picture(np.zeros((24, 32, 3)), np.ones((24, 32, 3)))) as device,
         pytest.raises(hardware.WrongDeviceError, match="LED controller TWIN0"),
     ):
-        device.commissioned(device.Simulated(workdir, size=(32, 24)), device)
+        commissioned(Simulated(workdir, size=(32, 24)), device)
