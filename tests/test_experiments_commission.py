@@ -208,7 +208,7 @@ def test_another_controller_on_the_port_is_refused(tmp_path, peer):
         levels=(255, 255, 255, 255),
         commissioned="2026-05-31",
     )
-    device.save(tmp_path / "bench", sts.Sensor().constants())
+    device.save(tmp_path / "bench", sts.Sensor())
     with pytest.raises(hardware.WrongDeviceError, match=r"LED controller OTHER, but .* LED controller EMULATED"):
         hardware.STS.from_file(tmp_path / "bench", leds=peer.path).connect()
     hardware.Leds.connect(peer.path).close()  # the port is free again
@@ -402,8 +402,8 @@ def test_each_stream_of_a_device_has_its_exposure(peer, config, monkeypatch, cap
     assert found.white_balance == 4600
     assert found.exposures is not None
     assert found.exposures[0] > 3 * found.exposures[1]
-    for stream in ("visual", "tactile"):
-        assert 170 <= hardware.brightness(found.background(config.out, stream)) <= 230
+    for background in found.backgrounds(config.out):
+        assert 170 <= hardware.brightness(background) <= 230
     with hardware.STS.from_file(config.out, leds=peer.path) as sensor:
         for _ in range(3):
             pair = sensor.read()
