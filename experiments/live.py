@@ -67,7 +67,8 @@ class Config:
     seconds: float | None = None  # stop after this time (s). None: stop at the end of a replay, or on Ctrl-C
 
     record: Path | None = None  # record both streams into this new folder
-    encoding: Literal["png", "jpeg"] = "png"  # format of recorded images. PNG is lossless, JPEG is faster and smaller
+    # format of the videos: FFV1 is lossless, motion JPEG is faster and smaller
+    encoding: Literal["ffv1", "mjpeg"] = "ffv1"
     save: Path | None = None  # write up to six moments of the live view and the predictions to a picture
     headless: bool = False  # print the predictions in this terminal instead of serving a page
     host: str = "127.0.0.1"  # address of the page. With 0.0.0.0, every computer of the network can watch
@@ -249,8 +250,8 @@ def follow(config: Config, source: Source, predictor: sts.Predictor, page: LiveP
                 screen.add(shot)
                 if config.seconds is not None and time.monotonic() > started_s + config.seconds:
                     break
-        except hardware.EndOfVideoError as error:
-            say(str(error))
+            else:
+                say("the replay has ended")
         except KeyboardInterrupt:
             say("stopped")
         summarise(live, sensor, time.monotonic() - started_s)

@@ -7,7 +7,7 @@ import numpy as np
 
 from sts_jax.hardware.leds import Lit
 from sts_jax.hardware.proof import Settling, Shot
-from sts_jax.hardware.recorder import Recorder
+from sts_jax.hardware.recording import Recorder
 from sts_jax.hardware.session import Origin
 
 SIZE = (48, 64)

@@ -288,18 +288,6 @@ def test_too_many_waiting_pairs_are_refused_and_too_little_space_is_named(tmp_pa
             session.confirm(0)
 
 
-@pytest.fixture
-def small_disk(tmp_path):
-    """A file system of 300 kB."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", "size=300k", "tmpfs", str(folder)]
-    if not sys.platform.startswith("linux") or os.geteuid() != 0 or subprocess.run(command, check=False).returncode:
-        pytest.skip("mounting a small file system needs root")
-    yield folder
-    subprocess.run(["umount", "-l", str(folder)], check=True)
-
-
 def test_a_disk_that_is_really_full(small_disk):
     ballast = small_disk / "ballast"
     with Session.open(small_disk / "session", ORIGIN) as session:

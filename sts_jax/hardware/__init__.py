@@ -63,8 +63,7 @@ from sts_jax.hardware.lens import (
 )
 from sts_jax.hardware.opencv import OpenCVCamera
 from sts_jax.hardware.proof import LightError, NoContrastError, NotStillError, Pair, Settling, Shot
-from sts_jax.hardware.recorder import Recorder
-from sts_jax.hardware.replay import Replay
+from sts_jax.hardware.recording import Recorder, Replay
 from sts_jax.hardware.sensor_file import Device, SensorFileError, WrongDeviceError, copy_sensor
 from sts_jax.hardware.session import (
     Entry,

@@ -1,0 +1,305 @@
+"""`Recorder` and `Replay`: what is played back is what was recorded."""
+
+import dataclasses
+import itertools
+import math
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from recording_writer import ORIGIN, PERIOD_S, SIZE, shot, write
+from test_experiments_real import sensor_file
+
+from benchmarks.instruments.sensor_peer import SensorPeer
+from sts_jax import hardware
+from sts_jax.storage import DamagedFileError
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("recorded") / "recording"
+    assert list(write(folder, range(12))) == list(range(12))
+    return folder
+
+
+@pytest.fixture
+def folder(recorded, tmp_path):
+    return Path(shutil.copytree(recorded, tmp_path / "recording"))
+
+
+@pytest.fixture
+def interrupted(folder):
+    """The recording as a kill leaves it."""
+    (folder / "manifest.json").unlink()
+    return folder
+
+
+def played(source, **options):
+    with hardware.Replay(source, **{"speed": None, **options}) as replay:
+        return list(replay.stream())
+
+
+def numbers(shots):
+    return [one.sequence // 3 for one in shots]
+
+
+def test_a_replay_equals_the_recording_in_every_pixel_and_time(folder):
+    found = played(folder)
+    assert len(found) == 12
+    for number, one in enumerate(found):
+        truth = shot(number)
+        np.testing.assert_array_equal(one.image, truth.image)
+        assert not one.image.flags.writeable
+        assert one.time_s - truth.time_s == pytest.approx(found[0].time_s - 100, abs=1e-6)
+        assert one.until_s - one.time_s == pytest.approx(0.01, abs=1e-6)
+        assert one.time_s - one.before.acknowledged_s == pytest.approx(0.1, abs=1e-6)
+        assert (one.stream, one.sequence, one.epoch) == (truth.stream, truth.sequence, truth.epoch)
+        assert (one.before.levels, one.before.counter, one.before.boot) == (truth.before.levels, number, 7)
+
+
+def test_motion_jpeg_is_near_the_truth(tmp_path):
+    smooth = cv2.GaussianBlur(shot(0).image, (0, 0), 5)
+    with hardware.Recorder(tmp_path / "jpeg", ORIGIN, encoding="mjpeg") as recorder:
+        recorder.add(dataclasses.replace(shot(0), image=smooth))
+    error = played(tmp_path / "jpeg")[0].image.astype(float) - smooth
+    assert 0 < np.abs(error).max() <= 8
+
+
+@pytest.mark.parametrize("encoding", ["ffv1", "mjpeg"])
+def test_the_videos_open_without_the_library(tmp_path, encoding):
+    """OpenCV reads the Matroska files, with their times."""
+    assert len(list(write(tmp_path / "made", range(20), encoding=encoding))) == 20
+    for stream in ("visual", "tactile"):
+        video = cv2.VideoCapture(str(tmp_path / "made" / f"{stream}.mkv"), cv2.CAP_FFMPEG)
+        assert (video.get(cv2.CAP_PROP_FRAME_WIDTH), video.get(cv2.CAP_PROP_FRAME_HEIGHT)) == (SIZE[1], SIZE[0])
+        for number in range(stream == "tactile", 20, 2):
+            good, image = video.read()
+            assert good
+            # OpenCV counts from the first image of the video
+            seen_s = PERIOD_S * (number - (stream == "tactile"))
+            assert video.get(cv2.CAP_PROP_POS_MSEC) == pytest.approx(1000 * seen_s, abs=1)
+            if encoding == "ffv1":
+                np.testing.assert_array_equal(image[..., ::-1], shot(number).image)
+        assert not video.read()[0]
+
+
+@pytest.mark.slow
+def test_a_killed_recording_keeps_all_but_the_newest_images(tmp_path):
+    for attempt, images in enumerate((1, 7, 40)):
+        made = tmp_path / str(attempt)
+        command = [sys.executable, "tests/recording_writer.py", str(made)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+            for _ in range(images):
+                last = int(process.stdout.readline())
+            process.kill()
+            rest = process.stdout.read().split("\n")[:-1]  # complete lines
+            last = int(rest[-1]) if rest else last
+        if last < 2:
+            continue  # no image was complete
+        found = played(made)
+        for number, one in enumerate(found):
+            np.testing.assert_array_equal(one.image, shot(number).image)
+        assert last - 1 <= len(found) <= last + 2
+
+
+def test_an_interrupted_recording_ends_at_its_last_complete_image(interrupted):
+    """Both files cut at many places, as if the process had been killed there."""
+    video, lines = (interrupted / name for name in ("tactile.mkv", "frames.jsonl"))
+    whole, every = video.read_bytes(), lines.read_bytes()
+    assert numbers(played(interrupted)) == list(range(12))
+    random = np.random.default_rng(0)
+    for size in (*random.integers(1000, len(whole), 30), len(whole) - 1):
+        video.write_bytes(whole[:size])
+        found = played(interrupted)
+        tactile = [number for number in numbers(found) if number % 2]
+        assert numbers(found) == sorted([0, 2, 4, 6, 8, 10, *tactile])
+        assert len(tactile) >= int(6 * (size - 1000) / len(whole)) - 1
+        for number, one in zip(numbers(found), found, strict=True):
+            np.testing.assert_array_equal(one.image, shot(number).image)
+    video.write_bytes(whole)
+    for size in (*random.integers(1000, len(every), 10), len(every) - 1):
+        lines.write_bytes(every[:size])
+        assert numbers(played(interrupted)) == list(range(every[:size].count(b"\n")))
+    video.unlink()  # the process was killed before the first tactile image
+    assert numbers(played(interrupted)) == [0, 2, 4, 6, 8, 10]
+
+
+def test_a_full_disk_keeps_what_was_recorded(small_disk):
+    recorder = hardware.Recorder(small_disk / "made", ORIGIN)
+
+    def fill():
+        for number in itertools.count():
+            recorder.add(shot(number))
+
+    with pytest.raises(OSError, match=r"cannot record to .*Free some disk space.* before are kept"):
+        fill()
+    with pytest.raises(ValueError, match="has ended: make a new one"):
+        fill()
+    number = sum(recorder.counts.values())
+    recorder.close()
+    found = played(small_disk / "made")
+    assert number - 4 <= len(found) <= number
+    for one in found:
+        np.testing.assert_array_equal(one.image, shot(one.sequence // 3).image)
+
+
+def test_pairs_follow_the_recorded_order(tmp_path):
+    """An image belongs to the next one of the other stream, unless the camera or the controller was lost between."""
+    with hardware.Recorder(tmp_path / "made", ORIGIN) as recorder:
+        for number, epoch in [(0, 0), (1, 0), (3, 0), (2, 0), (4, 0), (6, 0), (7, 0), (8, 0), (9, 1), (10, 1)]:
+            one = shot(number, epoch=epoch)
+            recorder.add(dataclasses.replace(one, time_s=200 + recorder.counts["visual"] + recorder.counts["tactile"]))
+    with hardware.Replay(tmp_path / "made", speed=None) as replay:
+        pairs = [replay.read() for _ in range(4)]
+        with pytest.raises(EOFError, match="has no further pair of images"):
+            replay.read()
+    assert [(*numbers([pair.visual, pair.tactile]),) for pair in pairs] == [(0, 1), (2, 3), (6, 7), (10, 9)]
+
+
+def test_images_come_at_their_times(folder):
+    """At 10 times the speed, and never before their time. `read` returns none from before the call."""
+    with hardware.Replay(folder, speed=10.0) as replay:
+        for one in replay.stream():
+            assert time.monotonic() >= one.time_s
+            if one.sequence == 9:
+                break
+        called_s = time.monotonic()
+        pair = replay.read()
+        assert min(pair.visual.time_s, pair.tactile.time_s) >= called_s
+        assert time.monotonic() >= max(pair.visual.time_s, pair.tactile.time_s)
+
+
+def test_late_readers_miss_images(folder):
+    with hardware.Replay(folder, speed=1.0) as replay:
+        replay._shots = replay._play(time.monotonic() - 0.4)  # the buffer covers the last 0.25 s
+        (first,) = numbers([next(replay.stream())])
+        assert first >= 3
+        assert replay.skipped == first
+
+
+def test_a_loop_counts_connections(folder):
+    with hardware.Replay(folder, speed=None, loop=True) as replay:
+        found = list(itertools.islice(replay.stream(), 30))
+    assert numbers(found) == [*range(12), *range(12), *range(6)]
+    assert [one.epoch for one in found] == [0] * 12 + [1] * 12 + [2] * 6
+    assert all(b.time_s > a.time_s for a, b in itertools.pairwise(found))
+    with hardware.Recorder(folder.with_name("dark"), ORIGIN) as recorder:
+        recorder.add(shot(0))
+    with hardware.Replay(folder.with_name("dark"), speed=None, loop=True) as replay, pytest.raises(EOFError):
+        replay.read()  # visual images form no pairs
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "recording.json", "frames.jsonl", "visual.mkv", "tactile.mkv"])
+def test_damage_is_found(folder, tmp_path, name):
+    path, random = folder / name, np.random.default_rng(0)
+    data = path.read_bytes()
+
+    def refused():
+        with pytest.raises(DamagedFileError, match=rf"{name}.*copy the recording again"):
+            hardware.Replay(folder)
+
+    for place in random.integers(0, len(data) - 1, 20):
+        path.write_bytes(data[:place] + bytes([data[place] ^ 1 << random.integers(0, 7)]) + data[place + 1 :])
+        refused()
+    path.write_bytes(data[:-10])
+    refused()
+    if name not in ("manifest.json", "recording.json"):  # without them, it is interrupted, or no recording
+        path.unlink()
+        refused()
+        list(write(tmp_path / "other", range(2, 12)))
+        path.write_bytes((tmp_path / "other" / name).read_bytes())
+        refused()
+
+
+def test_a_flipped_bit_in_an_interrupted_recording_is_no_other_image(interrupted):
+    path, random = interrupted / "visual.mkv", np.random.default_rng(1)
+    data = path.read_bytes()
+    for place in random.integers(1000, len(data) - 1000, 10):
+        path.write_bytes(data[:place] + bytes([data[place] ^ 4]) + data[place + 1 :])
+        with pytest.raises((ValueError, OSError)):
+            played(interrupted)
+    path.write_bytes(data)
+    text = (interrupted / "frames.jsonl").read_text()
+    (interrupted / "frames.jsonl").write_text(text.replace('"sequence": 9,', '"sequenc'))
+    with pytest.raises(DamagedFileError, match=r"frames.jsonl, line 4, is damaged"):
+        played(interrupted)
+
+
+def make_video(path, frames, *, lit=False, fps=25.0):
+    """A video whose frames have a grey value that follows from their number."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, SIZE[::-1])
+    for number in range(frames):
+        writer.write(np.full((*SIZE, 3), grey(number, lit), np.uint8))
+    writer.release()
+    return path
+
+
+def grey(number, lit):
+    return 40 + 10 * (number % 8) + 100 * lit
+
+
+def test_plain_videos_are_replayed_as_pairs(tmp_path):
+    videos = make_video(tmp_path / "visual.mp4", 20), make_video(tmp_path / "tactile.mp4", 20, lit=True)
+    last_s = None
+    with hardware.Replay(videos, speed=None, loop=True) as replay:
+        for number in range(45):
+            pair = replay.read()
+            assert abs(float(pair.visual.image.mean()) - grey(number % 20, False)) < 4
+            assert abs(float(pair.tactile.image.mean()) - grey(number % 20, True)) < 4
+            assert pair.visual.time_s == pair.tactile.time_s
+            assert math.isnan(pair.visual.until_s)
+            assert math.isnan(pair.tactile.before.acknowledged_s)
+            assert last_s is None or pair.visual.time_s - last_s == pytest.approx(1 / 25, abs=1e-6)
+            last_s = pair.visual.time_s
+    with pytest.raises(ValueError, match="the visual video has 20 frames, but the tactile video has 17: cut both"):
+        hardware.Replay((videos[0], make_video(tmp_path / "short.mp4", 17)))
+    videos[1].write_bytes(videos[0].read_bytes()[:-200])
+    with pytest.raises(ValueError, match=r"tactile.mp4"):
+        hardware.Replay(videos)
+
+
+def test_bad_input_is_named(folder, tmp_path):
+    with pytest.raises(FileExistsError, match="is not an empty folder: give the name of a new folder"):
+        hardware.Recorder(folder, ORIGIN)
+    small = dataclasses.replace(shot(0), image=np.zeros((4, 4, 3), np.uint8))
+    match = r"has shape \(4, 4, 3\), but all images of this recording must have"
+    with hardware.Recorder(tmp_path / "new", ORIGIN) as recorder, pytest.raises(ValueError, match=match):
+        recorder.add(small)
+    with pytest.raises(ValueError, match="has no image"):
+        hardware.Replay(tmp_path / "new")
+    with pytest.raises(FileNotFoundError, match=r"holds no recording \(recording.json is missing\)"):
+        hardware.Replay(tmp_path / "none")
+    with pytest.raises(RuntimeError, match="is not connected: call connect"):
+        hardware.Replay(folder).read()
+    for speed in (0, -1, math.nan, math.inf):
+        with pytest.raises(ValueError, match="speed must be > 0 and finite, or None, got"):
+            hardware.Replay(folder, speed=speed)
+
+
+def test_a_recorded_sensor_replays_with_its_sensor_file(tmp_path):
+    """Against a sensor's devices: the light of each replayed image is the one in the log of the camera."""
+    peer = SensorPeer(tmp_path / "leds")
+    try:
+        file = sensor_file(peer, tmp_path / "sensor.json")
+        with (
+            hardware.STS.from_file(file, leds=peer.path) as sensor,
+            hardware.Recorder(tmp_path / "made", hardware.Origin.of(sensor), file=file) as recorder,
+        ):
+            for one, _ in zip(sensor.stream(0.5), range(10), strict=False):
+                recorder.add(one)
+        replay = hardware.Replay(tmp_path / "made", speed=None)
+        assert replay.device == hardware.Device.load(file)
+        assert replay.device.background(tmp_path / "made", "tactile").mean() == pytest.approx(210)
+        with replay:
+            found = list(replay.stream())
+        assert len(found) == 10
+        for one in found:
+            assert peer.judged(one.image, lit=one.stream == "tactile")
+            assert one.before.acknowledged_s < one.time_s < one.until_s
+    finally:
+        peer.stop()
