@@ -1,27 +1,27 @@
-"""Duration of writing a visual and a tactile image to disk as `hardware.Session` does, and size of the files.
+"""Duration of writing images to disk as `hardware.Session` and `hardware.Recorder` do, and size of the files.
 
-    python -m benchmarks.recording                  # a few seconds
+    python -m benchmarks.recording                  # half a minute
     python -m benchmarks.recording --folder /mnt    # on another disk
 
-The command writes pairs of a visual and a tactile image as `hardware.Session` does. The folder of a pair contains both
-images as PNG files and their manifest, and is flushed to the disk. The images are synthetic and smooth,
-without noise or with noise of standard deviation 1.5 (of 255). For two image sizes, each without and with noise, the
-command prints the size of the files of a pair, the median time of encoding, the median time of writing, and the longest
-time of encoding and writing together. The command deletes the files afterwards.
+The images are synthetic and smooth, without noise or with noise of standard deviation 1.5 (of 255). The command prints
+the median and the longest time of writing a pair as a session does (PNG files, flushed to the disk), and of adding an
+image to a recording in each encoding. It deletes the files afterwards.
 """
 
 import dataclasses
 import statistics
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import get_args
 
 import cv2
 import numpy as np
 import tyro
 
 from sts_jax import storage
-from sts_jax.hardware import Lit, Pair, Shot, proof, session
+from sts_jax.hardware import Lit, Origin, Pair, Recorder, Shot, proof, recording, session
 
 SIZES = ((640, 480), (1640, 1232))
 
@@ -31,15 +31,12 @@ class Args:
     """Options of the command line."""
 
     folder: Path | None = None  # an existing folder on the disk to measure (default: the folder for temporary files)
-    pairs: int = 20  # number of pairs of each size and noise
+    pairs: int = 10  # number of pairs of each size and noise
     seed: int = 0  # seed of the images
 
 
 def pair(random: np.random.Generator, width: int, height: int, noise: float) -> Pair:
-    """Make a smooth visual and a smooth tactile image, and add noise to both.
-
-    The noise is normally distributed with the standard deviation `noise` (grey levels).
-    """
+    """Make a smooth visual and a smooth tactile image with noise of a standard deviation (grey levels)."""
 
     def shot(stream: proof.Stream, level: int) -> Shot:
         smooth = cv2.GaussianBlur(random.uniform(0, 1, (height, width, 3)).astype(np.float32), (0, 0), width / 50)
@@ -51,28 +48,45 @@ def pair(random: np.random.Generator, width: int, height: int, noise: float) -> 
     return Pair(shot("visual", 20), shot("tactile", 100))
 
 
+def measure(name: str, folder: Path, count: int, write: Callable[[int], object]) -> None:
+    """Call `write` with the numbers below `count`, and print its durations and the size of the folder."""
+    times = []
+    for number in range(count):
+        start = time.perf_counter()
+        write(number)
+        times.append(1e3 * (time.perf_counter() - start))
+    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / count
+    print(f"  {name:28s}  {size / 1e6:5.2f} MB  {statistics.median(times):5.0f} ms, at most {max(times):5.0f} ms")
+
+
 def main(args: Args) -> None:
-    """Write image pairs of each size in SIZES, without and with noise, and print the durations and file sizes."""
+    """Measure each size in SIZES, without and with noise."""
     random = np.random.default_rng(args.seed)
-    print("size         noise   MB a pair   ms to encode   ms to write   longest of both")
     for width, height in SIZES:
         for noise in (0.0, 1.5):
+            print(f"{width} x {height}, noise {noise}")
             taken = pair(random, width, height, noise)
-            encoding, writing, size = [], [], 0
-            with tempfile.TemporaryDirectory(dir=args.folder) as folder:
-                for number in range(args.pairs):
-                    start = time.perf_counter()
-                    files = session.encoded_pair(taken)
-                    middle = time.perf_counter()
-                    storage.write_folder(Path(folder) / str(number), files)
-                    encoding.append(1e3 * (middle - start))
-                    writing.append(1e3 * (time.perf_counter() - middle))
-                    size = sum(map(len, files.values()))
-            longest = max(a + b for a, b in zip(encoding, writing, strict=True))
-            print(
-                f"{width:4d} x {height:4d}  {noise:5.1f}  {size / 1e6:10.1f}  {statistics.median(encoding):13.0f}"
-                f"  {statistics.median(writing):12.0f}  {longest:16.0f}"
-            )
+            with tempfile.TemporaryDirectory(dir=args.folder) as temporary:
+                folder = Path(temporary)
+                measure(
+                    "pair of a session",
+                    folder / "session",
+                    args.pairs,
+                    lambda number, folder=folder, taken=taken: storage.write_folder(
+                        folder / "session" / str(number), session.encoded_pair(taken), {}
+                    ),
+                )
+                for encoding in get_args(recording.Encoding):
+                    origin = Origin("camera", "leds", width, height, (255,) * 4)
+                    with Recorder(folder / encoding, origin, encoding=encoding) as recorder:
+                        measure(
+                            f"image of a recording, {encoding}",
+                            folder / encoding,
+                            args.pairs,
+                            lambda number, recorder=recorder, shot=taken.visual: recorder.add(
+                                dataclasses.replace(shot, time_s=0.05 * number)
+                            ),
+                        )
 
 
 if __name__ == "__main__":
