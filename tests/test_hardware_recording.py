@@ -292,9 +292,10 @@ def test_a_recorded_sensor_replays_with_its_sensor_file(tmp_path):
         ):
             for one, _ in zip(sensor.stream(0.5), range(10), strict=False):
                 recorder.add(one)
+            assert hardware.Replay(tmp_path / "made").device is not None  # before the recording ends
         replay = hardware.Replay(tmp_path / "made", speed=None)
         assert replay.device == hardware.Device.load(file)
-        assert replay.device.background(tmp_path / "made", "tactile").mean() == pytest.approx(210)
+        assert replay.device.backgrounds(tmp_path / "made")[1].mean() == pytest.approx(210)
         with replay:
             found = list(replay.stream())
         assert len(found) == 10

@@ -7,7 +7,7 @@
     sensor.json            only if a sensor file was given: a copy, with its background images
     manifest.json          checksums of the files above, written at the end
 
-A recording without a manifest was interrupted. It ends at the last line of frames.jsonl whose image is in the video.
+A recording whose manifest does not list them was interrupted. It ends at the last line of frames.jsonl whose image is in the video.
 """
 
 import collections
@@ -18,12 +18,10 @@ import itertools
 import json
 import math
 import os
-import shutil
 import time
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
-from types import TracebackType
 from typing import Literal
 
 import av
@@ -33,7 +31,7 @@ from sts_jax import storage
 from sts_jax.hardware import protocol
 from sts_jax.hardware.leds import Lit
 from sts_jax.hardware.proof import Pair, Settling, Shot, Stream
-from sts_jax.hardware.sensor_file import Device, sensor_file
+from sts_jax.hardware.sensor_file import Device, copy_sensor, sensor_file
 from sts_jax.hardware.session import Origin, shot_facts, shot_of
 from sts_jax.storage import DamagedFileError
 
@@ -94,13 +92,12 @@ class Recorder:
         self._size = origin.height, origin.width
         self._encoding = encoding
         self._start_s: float | None = None  # time of the first image (s)
-        self._videos: dict[str, tuple[av.container.OutputContainer, av.VideoStream]] = {}
+        self._videos: dict[str, av.VideoStream] = {}
         self._open = True
         if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
             raise FileExistsError(f"{self.folder} is not an empty folder: give the name of a new folder.")
         self.folder.mkdir(parents=True, exist_ok=True)
-        if file is not None:
-            _copy_sensor(sensor_file(file), self.folder)
+        self._copied = {} if file is None else copy_sensor(file, self.folder)
         head = {
             "encoding": encoding,
             "origin": dataclasses.asdict(origin),
@@ -121,10 +118,10 @@ class Recorder:
             )
         self._start_s = shot.time_s if self._start_s is None else self._start_s
         try:
-            container, video = self._videos.get(shot.stream) or self._video(shot.stream)
+            video = self._videos.get(shot.stream) or self._video(shot.stream)
             frame = av.VideoFrame.from_ndarray(shot.image, format="rgb24").reformat(format=video.pix_fmt)
             frame.pts = round(1000 * (shot.time_s - self._start_s))
-            container.mux(video.encode(frame))
+            video.container.mux(video.encode(frame))
             self._lines.write((json.dumps({"stream": shot.stream, **shot_facts(shot)}) + "\n").encode())
         except OSError as error:
             self._end()
@@ -134,7 +131,7 @@ class Recorder:
             ) from error
         self.counts[shot.stream] += 1
 
-    def _video(self, stream: Stream) -> tuple[av.container.OutputContainer, av.VideoStream]:
+    def _video(self, stream: Stream) -> av.VideoStream:
         """Begin the video of a stream."""
         container = av.open(str(self.folder / f"{stream}.mkv"), "w", format="matroska", options=_PER_IMAGE)
         pixels, options = _CODECS[self._encoding]
@@ -142,47 +139,36 @@ class Recorder:
         video.height, video.width = self._size
         video.pix_fmt, video.time_base = pixels, Fraction(1, 1000)
         video.codec_context.time_base = video.time_base
-        self._videos[stream] = container, video
-        return container, video
+        self._videos[stream] = video
+        return video
 
     def _end(self) -> None:
         """Close the files."""
         self._open = False
         self._lines.close()
         while self._videos:
-            container, _ = self._videos.popitem()[1]
             with contextlib.suppress(OSError):
-                container.close()
+                self._videos.popitem()[1].container.close()
 
     def close(self) -> None:
         """Close the files, and write the manifest. Closing twice is allowed."""
         if not self._open:
             return
         try:
-            for container, video in self._videos.values():
-                container.mux(video.encode())
-                container.close()
+            for video in self._videos.values():
+                video.container.mux(video.encode())
+                video.container.close()
         finally:
             self._end()
-        names = [path.name for path in self.folder.iterdir()]
-        storage.write_manifest(self.folder, storage.checksums(self.folder, sorted(names)))
+        written = {path.name for path in self.folder.iterdir()} - {storage.MANIFEST} - self._copied.keys()
+        files = {**self._copied, **storage.checksums(self.folder, sorted(written))}
+        storage.write_manifest(self.folder, files)
 
     def __enter__(self) -> "Recorder":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def _copy_sensor(file: Path, folder: Path) -> None:
-    """Copy a sensor file and its background images into a folder."""
-    device = Device.load(file)
-    for background in (device.background_visual, device.background_tactile):
-        if background is not None:
-            shutil.copyfile(file.with_name(background.name), folder / background.name)
-    shutil.copyfile(file, folder / "sensor.json")
 
 
 class Replay:
@@ -249,10 +235,6 @@ class Replay:
         self._shots = self._play(time.monotonic())
         return self
 
-    def disconnect(self) -> None:
-        """End the replay."""
-        self._shots = None
-
     def stream(self) -> Iterator[Shot]:
         """Iterate over the images in the order of the recording. Each step waits until its image is available."""
         if self._shots is None:
@@ -277,10 +259,8 @@ class Replay:
     def __enter__(self) -> "Replay":
         return self if self._shots is not None else self.connect()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.disconnect()
+    def __exit__(self, *_: object) -> None:
+        self._shots = None
 
     def _play(self, start_s: float) -> Iterator[Shot]:
         """The images, from a time on the clock `time.monotonic` (s)."""
@@ -330,7 +310,7 @@ def _recorded(folder: Path, videos: dict[Stream, Path]) -> list[Shot]:
     manifest = storage.read_manifest(folder, _AGAIN)
     if manifest is not None:
         storage.verify(folder, manifest, _AGAIN)
-    # An interrupted program leaves an incomplete line, and lines whose images are not in the video yet.
+    # An interrupted program leaves an incomplete last line, and lines whose images are not in the videos yet.
     left = collections.Counter({stream: _count(path) for stream, path in videos.items()})
     stills = []
     for number, line in enumerate((folder / FRAMES).read_bytes().split(b"\n")[:-1], 1):
