@@ -13,6 +13,8 @@ import atexit
 import importlib.metadata
 import os
 import shutil
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 

@@ -216,14 +216,7 @@ def test_damage_is_found(folder, tmp_path, name):
         refused()
 
 
-def test_a_flipped_bit_in_an_interrupted_recording_is_no_other_image(interrupted):
-    path, random = interrupted / "visual.mkv", np.random.default_rng(1)
-    data = path.read_bytes()
-    for place in random.integers(1000, len(data) - 1000, 10):
-        path.write_bytes(data[:place] + bytes([data[place] ^ 4]) + data[place + 1 :])
-        with pytest.raises((ValueError, OSError)):
-            played(interrupted)
-    path.write_bytes(data)
+def test_a_damaged_line_of_an_interrupted_recording_is_named(interrupted):
     text = (interrupted / "frames.jsonl").read_text()
     (interrupted / "frames.jsonl").write_text(text.replace('"sequence": 9,', '"sequenc'))
     with pytest.raises(DamagedFileError, match=r"frames.jsonl, line 4, is damaged"):

@@ -7,7 +7,8 @@
     sensor.json            only if a sensor file was given: a copy, with its background images
     manifest.json          checksums of the files above, written at the end
 
-A recording whose manifest does not list them was interrupted. It ends at the last line of frames.jsonl whose image is in the video.
+The manifest of an interrupted recording does not list the videos. Such a recording ends with the last line of
+frames.jsonl whose image is in a video.
 """
 
 import collections
@@ -18,6 +19,7 @@ import itertools
 import json
 import math
 import os
+import statistics
 import time
 from collections.abc import Iterator
 from fractions import Fraction
@@ -38,9 +40,9 @@ from sts_jax.storage import DamagedFileError
 HEAD, FRAMES = "recording.json", "frames.jsonl"
 Encoding = Literal["ffv1", "mjpeg"]
 
-# Pixel format and options of each codec. FFV1 with Golomb codes and checksums, motion JPEG at its best quality.
+# Pixel format and options of each codec. FFV1 with Golomb codes, which are faster, motion JPEG at its best quality.
 _CODECS = {
-    "ffv1": ("bgr0", {"coder": "0", "slices": "4", "slicecrc": "1"}),
+    "ffv1": ("bgr0", {"coder": "0", "slices": "4"}),
     "mjpeg": ("yuvj444p", {"qmin": "1", "qmax": "1"}),
 }
 _PER_IMAGE = {"cluster_time_limit": "0", "flush_packets": "1"}  # Matroska in parts of one image, each written at once
@@ -265,8 +267,8 @@ class Replay:
     def _play(self, start_s: float) -> Iterator[Shot]:
         """The images, from a time on the clock `time.monotonic` (s)."""
         speed, first_s = self._speed or 1.0, self._stills[0].time_s
-        steps = sorted(b.time_s - a.time_s for a, b in itertools.pairwise(self._stills))
-        lap_s = self._stills[-1].time_s - first_s + (steps[len(steps) // 2] if steps else 1.0)
+        steps = [b.time_s - a.time_s for a, b in itertools.pairwise(self._stills) if b.time_s > a.time_s]
+        lap_s = self._stills[-1].time_s - first_s + (statistics.median(steps) if steps else 0.0)
         epochs = 1 + self._stills[-1].epoch - self._stills[0].epoch
         for lap in itertools.count() if self._loop else range(1):
             frames = {stream: _frames(path) for stream, path in self._videos.items()}
@@ -327,7 +329,10 @@ def _recorded(folder: Path, videos: dict[Stream, Path]) -> list[Shot]:
 
 def _unproven(videos: dict[Stream, Path]) -> list[Shot]:
     """The images of two videos without times of the light, without their pixels."""
-    times = {stream: sorted(_times(path)) for stream, path in videos.items()}
+    try:
+        times = {stream: sorted(_times(path)) for stream, path in videos.items()}
+    except EOFError as error:
+        raise ValueError(f"a video is truncated ({error}): copy it again.") from error
     counts = {stream: len(seen) for stream, seen in times.items()}
     if abs(counts["visual"] - counts["tactile"]) > _UNEQUAL:
         raise ValueError(
