@@ -131,9 +131,10 @@ def main(args: Args) -> str:
                 evaluation.predict(predictor, subset, given, scenario, num_samples=NUM_SAMPLES), test
             )
     notes = [
-        f"Outcomes drawn from the model's probabilities {title}: calibration error {if_calibrated(own.confidence):.3f}."
-        for title, own in scores.items()
-        if title in subsets and own.confidence is not None
+        f"Outcomes drawn from the model's probabilities {title}: calibration error "
+        f"{if_calibrated(errors[evaluation.CALIBRATION][:, 0]):.3f}."
+        for title, errors in scores.items()
+        if title in subsets and evaluation.CALIBRATION in errors
     ]
     if {"from visual", "from visual and tactile"} <= set(scores):
         gain = evaluation.gain(scores["from visual"], scores["from visual and tactile"], test)

@@ -12,7 +12,7 @@ from jaxtyping import ArrayLike
 from matplotlib.figure import Figure
 from PIL import Image
 
-from sts_jax.evaluation.views import outside
+from sts_jax.evaluation.figures.motion import outside
 from sts_jax.frame import Frame
 from sts_jax.objects import Body
 from sts_jax.physics import Trajectory

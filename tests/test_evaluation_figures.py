@@ -1,11 +1,16 @@
 """Figures show the numbers and pictures they are given."""
 
+import dataclasses
+
+import jax
+import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from PIL import Image
-from test_evaluation_scores import judged
+from test_evaluation_results import judged
 
+import sts_jax as sts
 from sts_jax import evaluation
 from sts_jax.evaluation import figures
 from sts_jax.evaluation.figures import drawing, motion
@@ -93,8 +98,7 @@ def test_predictions_without_samples_or_touch_have_fewer_rows_and_columns(tmp_pa
 
 def test_a_calibration_figure_shows_shares_and_counts_of_each_bin(tmp_path, drawn):
     confidence, right = np.array([0.91, 0.95, 0.93, 0.55]), np.array([True, True, False, True])
-    scores = evaluation.Scores(*[None] * 8)
-    by_name = {"deterministic": scores, "from vision": scores._replace(confidence=confidence, right=right)}
+    by_name = {"deterministic": {}, "from vision": {evaluation.CALIBRATION: np.stack([confidence, right], 1)}}
     figures.calibration(tmp_path / "a.png", by_name, title="t")
     above, below = drawn[0].axes
     (points,) = [line for line in above.lines if line.get_marker() == "o"]
@@ -161,3 +165,20 @@ def test_a_loss_that_becomes_negative_is_drawn_on_a_linear_axis(tmp_path, drawn,
     axis = drawn[0].axes[0]
     assert axis.get_yscale() == scale
     assert axis.get_ylim()[0] < last
+
+
+def test_a_slope_is_drawn_as_a_slope():
+    fork = sts.objects.make(jax.random.key(0), "fork")
+    red = dataclasses.replace(fork, colors=fork.colors * 0 + jnp.array([1.0, 0, 0]))
+    size, slope = jnp.array([0.15, 0.15]), jnp.pi / 6
+    up = jnp.array([0.0, -jnp.sin(slope), jnp.cos(slope)])
+    stand = jnp.array([1.0, 0, 0, 0])
+
+    def place(position, up):
+        picture = np.asarray(evaluation.outside(red, jnp.concatenate([position, stand]), size, up)).astype(float)
+        return np.argwhere(picture[..., 0] > picture[..., 1] + 0.3).mean(0)
+
+    level = place(jnp.array([0.0, 0, 0.06]), jnp.array([0.0, 0, 9.81]))
+    np.testing.assert_allclose(place(0.06 * up, 9.81 * up), level, atol=2)  # the object above the pad is drawn above it
+    downhill = place(jnp.array([0.0, 0.04, 0.06]), 9.81 * up)
+    assert downhill[0] > place(jnp.array([0.0, 0.04, 0.06]), None)[0] + 8

@@ -163,19 +163,22 @@ def test_a_lens_left_as_it_is_lies_far_from_the_rectified_one():
     assert accuracy.value > 0.99
 
 
-def test_bad_input_is_refused_with_its_name():
-    images, group = scenes(6, 6)
-    frames = seen(images, CLEAN)
-    with pytest.raises(ValueError, match="real must be uint8"):
-        gap.pixel_errors(images, frames, group)
-    with pytest.raises(ValueError, match="equal shapes"):
-        gap.pixel_errors(frames, frames[:, :64], group)
-    with pytest.raises(ValueError, match="at least 64 pixels"):
-        gap.features(frames[:, :32])
-    described = gap.features(frames)
-    with pytest.raises(ValueError, match="Number of common trajectories: 2"):
-        gap.energy_distance(described, described, group, group + 4)
-    with pytest.raises(ValueError, match="at least 5 trajectories, got 3"):
-        gap.told_apart(described[:6], described, group[:6], group + 6)
-    with pytest.raises(ValueError, match="simulated must be finite, got nan"):
-        gap.energy_distance(described, np.where(described > 0.5, np.nan, described), group, group + 6)
+IMAGES = np.zeros((12, 72, 96, 3), np.uint8)
+NUMBERS, GROUP = np.zeros((12, 3)), np.repeat(np.arange(6), 2)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: gap.pixel_errors(IMAGES / 255, IMAGES, GROUP), "real must be uint8"),
+        (lambda: gap.pixel_errors(IMAGES, IMAGES[:, :64], GROUP), "equal shapes"),
+        (lambda: gap.features(IMAGES[:, :32]), "at least 64 pixels"),
+        (lambda: gap.features(IMAGES / 255), "images must be uint8"),
+        (lambda: gap.energy_distance(NUMBERS, NUMBERS, GROUP, GROUP + 4), "got 2 common trajectories"),
+        (lambda: gap.told_apart(NUMBERS[:6], NUMBERS, GROUP[:6], GROUP + 6), "at least 5 trajectories, got 3"),
+        (lambda: gap.energy_distance(NUMBERS, NUMBERS * np.nan, GROUP, GROUP + 6), "simulated must be finite, got nan"),
+    ],
+)
+def test_bad_calls_are_refused(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()

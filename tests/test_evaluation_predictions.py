@@ -4,7 +4,7 @@ import types
 
 import numpy as np
 import pytest
-from test_evaluation_scores import FELL, RESTS, judged, pairs
+from test_evaluation_results import FELL, RESTS, judged, pairs
 
 from sts_jax import evaluation, physics, training
 

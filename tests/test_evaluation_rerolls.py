@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_evaluation_scores import pairs
+from test_evaluation_results import pairs
 
 import sts_jax as sts
 from sts_jax import dataset, evaluation, physics
-from sts_jax.evaluation import rerolls
+from sts_jax.evaluation import references
 from sts_jax.physics.arguments import check_start
 
 TIMES, SIDE = 3, 4
@@ -49,8 +49,8 @@ def engine(monkeypatch):
         image = jnp.broadcast_to(grey[:, None, None, None], (len(pose), *resolution, 3)).astype(jnp.uint8)
         return image, image, image[..., 0] > 0
 
-    monkeypatch.setattr(rerolls.physics, "simulate", simulate)
-    monkeypatch.setattr(rerolls.dataset, "render_uint8", render)
+    monkeypatch.setattr(references.physics, "simulate", simulate)
+    monkeypatch.setattr(references.dataset, "render_uint8", render)
     return seen
 
 

@@ -81,10 +81,10 @@ def test_the_ceilings_are_computed_once(workdir, monkeypatch):
     ceilings = evaluate.ceilings(split, data, test, judge=None, metrics=evaluation.METRICS)
     metrics = json.loads((workdir / "metrics.json").read_text())["predictors"]["ceiling (mean of re-rolls)"]
     mean = ceilings.scores["ceiling (mean of re-rolls)"]
-    assert mean.position.mean() == pytest.approx(metrics["position"]["value"])
-    assert mean.best.bce.shape == (len(test.object),)
+    assert mean["position"].mean() == pytest.approx(metrics["position"]["value"])
+    assert mean["visual_skill_best"].shape == (len(test.object), 3)
     assert ceilings.pose.shape == (2, len(test.object), 7)
-    assert ceilings.scores["one re-roll"].log_loss is None
+    assert "outcome_log_loss" not in ceilings.scores["one re-roll"]
 
 
 def test_a_second_run_leaves_finished_results_unchanged(workdir):

@@ -282,7 +282,7 @@ def test_measurements_are_scored_against_the_truth_and_the_baselines(predictor):
     filled = evaluation.baselines(scenario, train, late)[copy].measurements["load"]
     np.testing.assert_allclose(filled, 55)  # the first frames were not measured
     few = evaluation.score(evaluation.first(rows["model"], 2), test, metrics=(metric,))
-    assert few.further["load_error"].shape == (2,)
+    assert few["load_error"].shape == (2,)
     own = np.asarray(predictor(measurements={"load": first[:, None]}).measurements["load"])[1:, 0]
     assert found["model"] == pytest.approx(np.abs(truth - own).mean(), rel=1e-4)
     assert metric.title == "load error (N)"

@@ -12,7 +12,7 @@ from sklearn.ensemble import HistGradientBoostingClassifier
 from sklearn.model_selection import GroupKFold
 from threadpoolctl import threadpool_limits
 
-from sts_jax.evaluation import intervals
+from sts_jax.evaluation import metrics
 
 FOLDS = 5
 SEEDS = 3  # classifiers for each fold, whose probabilities are averaged
@@ -89,5 +89,5 @@ def interval(statistic: Callable[..., float], *columns: np.ndarray, groups: np.n
         columns: Arguments of the statistic, `(n,)` each.
         groups: The group of each row, `(n,)`.
     """
-    draws = intervals.bootstrap(groups, lambda weight: np.asarray(statistic(*columns, weight)))
-    return Interval(statistic(*columns, np.ones(len(groups))), *intervals.interval(draws))
+    draws = metrics.bootstrap(groups, lambda weight: np.asarray(statistic(*columns, weight)))
+    return Interval(statistic(*columns, np.ones(len(groups))), *metrics.interval(draws))

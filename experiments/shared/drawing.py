@@ -102,12 +102,8 @@ def draw(
             _draw_ends(
                 drawn[-1], f"{name}, from {given}", run.sensor, test, predicted.samples.pose, rerolled[:, :num_shown]
             )
-    judged = {}
-    for given in (f"from {given}" for given in JUDGED_SUBSETS):
-        score = scores.get(f"{model}, {given}")
-        if score is not None and score.confidence is not None:
-            judged[given] = score
-    if judged:
+    judged = {f"from {given}": scores.get(f"{model}, from {given}", {}) for given in JUDGED_SUBSETS}
+    if any(evaluation.CALIBRATION in errors for errors in judged.values()):
         drawn.append(run.figures / "calibration.png")
         evaluation.figures.calibration(drawn[-1], judged, title=f"{name}: outcome probabilities of {model}")
     return drawn

@@ -305,29 +305,16 @@ def reroll(
 
 
 def _flat(made: Ceilings) -> dict[str, np.ndarray]:
-    """All arrays by a path such as `one re-roll/visual/bce` or `one re-roll/further/height_error`, for a file."""
-    arrays = {"pose": made.pose, "outcome": made.outcome}
-    for name, scores in made.scores.items():
-        for field, value in scores._asdict().items():
-            if isinstance(value, evaluation.metrics.ImageError):
-                arrays |= {f"{name}/{field}/{part}": leaf for part, leaf in value._asdict().items()}
-            elif isinstance(value, dict):
-                arrays |= {f"{name}/{field}/{part}": leaf for part, leaf in value.items()}
-            elif isinstance(value, np.ndarray):
-                arrays[f"{name}/{field}"] = value
-    return arrays
+    """All arrays by a path such as `one re-roll/position`, for a file."""
+    errors = {f"{name}/{metric}": x for name, scores in made.scores.items() for metric, x in scores.items()}
+    return {"pose": made.pose, "outcome": made.outcome, **errors}
 
 
 def _restored(arrays: dict[str, np.ndarray]) -> Ceilings:
     """The inverse of `_flat`."""
-    scores = {}
-    for name in evaluation.CEILINGS:
-        own = {key.removeprefix(f"{name}/"): leaf for key, leaf in arrays.items() if key.startswith(f"{name}/")}
-        fields: dict = dict.fromkeys(evaluation.Scores._fields) | {
-            key: leaf for key, leaf in own.items() if "/" not in key
-        }
-        for field in {key.partition("/")[0] for key in own if "/" in key}:
-            parts = {key.partition("/")[2]: leaf for key, leaf in own.items() if key.startswith(f"{field}/")}
-            fields[field] = parts if field == "further" else evaluation.metrics.ImageError(**parts)
-        scores[name] = evaluation.Scores(**fields)
+    scores: dict[str, evaluation.Scores] = {name: {} for name in evaluation.CEILINGS}
+    for path, errors in arrays.items():
+        if "/" in path:
+            name, metric = path.split("/", 1)
+            scores[name][metric] = errors
     return Ceilings(scores, arrays["pose"], arrays["outcome"])

@@ -1,244 +1,318 @@
-"""The metrics of summaries and tables (METRICS), and the default columns of `table` (COLUMNS)."""
+"""`Metric`, the library's metrics (METRICS), and the columns of the main table (COLUMNS)."""
 
 import dataclasses
 import functools
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
 from sts_jax import physics
+from sts_jax.dataset import Measurement, Pairs
 from sts_jax.evaluation import metrics
-from sts_jax.evaluation.records import Column, Judged, Metric, Statistic, mean
+from sts_jax.evaluation.predictions import Predicted, in_unit
 
-_Number = Callable[[Judged], Statistic | None]
+Scores = dict[str, np.ndarray]  # results of `Metric.errors` for n items by the metric's name, (n,) or (n, k)
 
 
-def _image(stream: str, kind: str) -> _Number:
-    """The statistic of an image metric.
+@dataclasses.dataclass(frozen=True)
+class Metric:
+    """A number that describes the quality of a predictor in summaries and tables.
 
-    Args:
-        stream: Field of `Scores`: `visual` or `tactile`, or `visual_object` or `tactile_object` (the object's pixels).
-        kind: `bce` or `excess`, as a mean per pixel and channel, or `skill`.
+    First, `errors` computes numbers for each item (held-out trajectory), because images are too large to keep. Then
+    `reduce` makes one number of them. The bootstrap over objects calls it many times, with different weights.
     """
 
-    def statistic(judged: Judged) -> Statistic | None:
-        error, constant = getattr(judged.scores, stream), getattr(judged.constant, stream)
-        if error is None:
-            return None
-        if kind == "skill":
-            return functools.partial(metrics.skill, error, constant)
-        return functools.partial(metrics.mean_per_pixel, getattr(error, kind), error.pixels)
+    name: str  # name in summaries
+    # Function of the predictions and the true items that returns one number per item, (n,), or several, (n, k). It
+    # returns None if the predictor does not predict the quantity. Metrics with the same function share one call.
+    errors: Callable[[Predicted, Pairs], np.ndarray | None]
+    unit: str = ""  # unit in tables, in brackets behind the heading
+    digits: int = 3  # number of decimals in tables
+    factor: float = 1.0  # value in tables divided by the value in summaries (SI units), such as 1e3 for mm
+    heading: str = ""  # heading of the column in tables (default: the name, with spaces)
+    # Function of the result of `errors` and of the weights of the items, (n,), that returns the metric.
+    reduce: Callable[[np.ndarray, np.ndarray], float] = metrics.mean
+    items: Callable[[Pairs], np.ndarray] | None = None  # the items that count, bool (n,) (default: all)
+    # Name of a metric. The value is then a skill: 1 minus the ratio of `reduce` to that of the constant prediction,
+    # with the constant prediction's errors in the metric of this name.
+    relative_to: str | None = None
+    interval: bool = True  # true if tables show the interval
+    column: bool = True  # true if the complete table has the metric (summaries always have it)
+    # "higher" or "lower": which values are better. The complete table then also shows the differences from the
+    # baselines. None: it does not.
+    compared: str | None = None
+    note: str = ""  # sentences above the table that explain the metric
 
-    return statistic
+    def __post_init__(self) -> None:
+        if not self.name:
+            raise ValueError("the name of a metric must not be empty: give it a name, such as 'height_error'")
+        if self.compared not in ("higher", "lower", None):
+            raise ValueError(
+                f"metric {self.name!r}: `compared` must be 'higher', 'lower' or None, got {self.compared!r}"
+            )
+
+    @property
+    def title(self) -> str:
+        """The heading of the metric's column in tables, with the unit, such as "position (mm)"."""
+        heading = self.heading or self.name.replace("_", " ")
+        return f"{heading} ({self.unit})" if self.unit else heading
 
 
-def _of(field: str, reduce: Callable[[np.ndarray, np.ndarray], float] = mean, *, on_pad: bool = False) -> _Number:
-    """The statistic of a field of `Scores` that has one number per item.
+class Column(NamedTuple):
+    """A column of the main table. Slashes separate the values of its metrics."""
 
-    Args:
-        field: Name of the field.
-        reduce: Function of the numbers and of the weights of the items, by default their weighted mean.
-        on_pad: True to use only the items whose object stays on the pad.
+    heading: str
+    metrics: tuple[Metric, ...]
+
+
+def measurement_error(measurement: Measurement) -> Metric:
+    """Make the metric `NAME_error` of a measurement in the predicted last frame.
+
+    Its mean is over the items whose last frame was measured. The error of a vector is the length of the difference
+    (unit of the measurement). That of an image is the mean absolute difference.
     """
 
-    def statistic(judged: Judged) -> Statistic | None:
-        values = getattr(judged.scores, field)
-        if values is None:
+    def errors(predicted: Predicted, test: Pairs) -> np.ndarray | None:
+        values = (predicted.measurements or {}).get(measurement.name)
+        if values is None or measurement.name not in test.measurements:
             return None
-        if not on_pad:
-            return functools.partial(reduce, values)
-        stayed = judged.test.outcome != int(physics.Outcome.FELL_OFF)
-        return lambda weight: reduce(values[stayed], weight[stayed])
+        difference = in_unit(values) - in_unit(test.measurements[measurement.name][:, 1])
+        return np.abs(difference).mean((1, 2, 3)) if measurement.is_image else np.linalg.norm(difference, axis=1)
 
-    return statistic
+    def measured(test: Pairs) -> np.ndarray:
+        return ~np.isnan(test.measurements[measurement.name][:, 1]).reshape(len(test.object), -1).any(1)
+
+    return Metric(f"{measurement.name}_error", errors, measurement.unit, items=measured, compared="lower")
 
 
-def _best(judged: Judged) -> Statistic | None:
-    if judged.scores.best is None or judged.constant.visual is None:
+def _image_errors(stream: str, *, inside: bool) -> Callable[[Predicted, Pairs], np.ndarray | None]:
+    """Errors of the images of a stream, or of the object's pixels, with the columns of `metrics.ImageError`."""
+
+    def errors(predicted: Predicted, test: Pairs) -> np.ndarray | None:
+        images = getattr(predicted, stream)
+        if images is None:
+            return None
+        mask = test.segmentation[:, 1] if inside else None
+        return np.stack(metrics.image_error(in_unit(images), getattr(test, stream)[:, 1] / 255, mask), 1)
+
+    return errors
+
+
+def _best_errors(predicted: Predicted, test: Pairs) -> np.ndarray | None:
+    if predicted.samples is None or predicted.samples.visual is None:
         return None
-    return functools.partial(metrics.skill, judged.scores.best, judged.constant.visual)
+    truth = test.visual[:, 1] / 255
+    return np.stack(metrics.best_of([metrics.image_error(in_unit(x), truth) for x in predicted.samples.visual]), 1)
 
 
-def _sharpness(judged: Judged) -> Statistic | None:
-    own = judged.scores
-    if own.gradient is None or own.gradient_target is None:
+def _gradients(predicted: Predicted, test: Pairs) -> np.ndarray | None:
+    """Gradient energy of the visual image (mean over the samples), and of the true one."""
+    samples = None if predicted.samples is None else predicted.samples.visual
+    if samples is not None:
+        energy = np.mean([metrics.gradient_energy(in_unit(image)) for image in samples], axis=0)
+    elif predicted.visual is not None:
+        energy = metrics.gradient_energy(in_unit(predicted.visual))
+    else:
         return None
-    return functools.partial(metrics.mean_per_pixel, own.gradient, own.gradient_target)
+    return np.stack([energy, metrics.gradient_energy(test.visual[:, 1] / 255)], 1)
 
 
-def _accuracy(judged: Judged) -> Statistic | None:
-    if judged.scores.outcome is None:
+def _of_pose(
+    function: Callable[[np.ndarray, np.ndarray], np.ndarray],
+) -> Callable[[Predicted, Pairs], np.ndarray | None]:
+    return lambda predicted, test: None if predicted.pose is None else function(predicted.pose, test.pose[:, 1])
+
+
+def _energy(predicted: Predicted, test: Pairs) -> np.ndarray | None:
+    """Energy score of the position, which is the error of a prediction without samples (m)."""
+    if predicted.samples is not None and predicted.samples.pose is not None:
+        return metrics.energy_score(predicted.samples.pose[..., :3], test.pose[:, 1, :3])
+    return _position(predicted, test)
+
+
+def _coverage(predicted: Predicted, test: Pairs) -> np.ndarray | None:
+    if predicted.samples is None or predicted.samples.pose is None:
         return None
-    return functools.partial(metrics.balanced_accuracy, judged.scores.outcome, judged.test.outcome)
+    return metrics.coverage(predicted.samples.pose[..., :3], test.pose[:, 1, :3])
 
 
-def _calibration(judged: Judged) -> Statistic | None:
-    own = judged.scores
-    if own.confidence is None or own.right is None:
+def _outcomes(predicted: Predicted, test: Pairs) -> np.ndarray | None:
+    """Predicted and true outcome."""
+    return None if predicted.outcome is None else np.stack([predicted.outcome, test.outcome], 1)
+
+
+def _log_loss(predicted: Predicted, test: Pairs) -> np.ndarray | None:
+    if predicted.outcome_probability is None:
         return None
-    return functools.partial(metrics.calibration_error, own.confidence, own.right)
+    return metrics.log_loss(predicted.outcome_probability, (test.outcome[:, None] == predicted.outcomes).argmax(1))
 
 
-def _auc(judged: Judged) -> Statistic | None:
-    if judged.scores.fell_off is None:
+def _confidence(predicted: Predicted, test: Pairs) -> np.ndarray | None:
+    """Probability of the likeliest outcome, and 1 if this is the true outcome."""
+    probability, outcomes = predicted.outcome_probability, predicted.outcomes
+    if probability is None or outcomes is None:
         return None
-    fell = judged.test.outcome == int(physics.Outcome.FELL_OFF)
-    return functools.partial(metrics.auc, fell, judged.scores.fell_off)
+    return np.stack([probability.max(1), outcomes[probability.argmax(1)] == test.outcome], 1)
 
 
+def _falls(predicted: Predicted, test: Pairs) -> np.ndarray | None:
+    """Predicted probability of falling off, and 1 if the object falls off."""
+    probability, outcomes = predicted.outcome_probability, predicted.outcomes
+    if probability is None or outcomes is None:
+        return None
+    fell_off = int(physics.Outcome.FELL_OFF)
+    return np.stack([probability[:, outcomes.tolist().index(fell_off)], test.outcome == fell_off], 1)
+
+
+def _stays(test: Pairs) -> np.ndarray:
+    return test.outcome != int(physics.Outcome.FELL_OFF)
+
+
+def _excess(errors: np.ndarray, weight: np.ndarray) -> float:
+    return float((weight * errors[:, 1]).sum())
+
+
+def _image_metrics(stream: str, *, inside: bool) -> tuple[Metric, Metric, Metric]:
+    """Cross-entropy, excess and skill of a stream."""
+    errors, name = _image_errors(stream, inside=inside), f"{stream}_{{}}{'_object' if inside else ''}".format
+    words = stream + " {}" + (" on the object" if inside else "")
+    bce, excess = (lambda x, w, column=column: metrics.ratio(x[:, column], x[:, 2], w) for column in (0, 1))
+    note = "BCE is the binary cross-entropy of an image. BCE and excess are in nats per pixel and channel."
+    explained = (
+        "Excess is the cross-entropy of an image minus the entropy of the true image. Skill is 1 minus the ratio "
+        "of the excess to that of the constant prediction. With samples, it is the skill of their mean image."
+    )
+    record = functools.partial(Metric, errors=errors, interval=False, column=not inside)
+    return (
+        record(name("bce"), heading=words.format("BCE"), digits=4, reduce=bce, note=note),
+        record(name("excess"), heading=words.format("excess x1e-4"), factor=1e4, digits=1, reduce=excess),
+        Metric(
+            name("skill"),
+            errors,
+            heading=words.format("skill"),
+            reduce=_excess,
+            relative_to=name("skill"),
+            compared="higher",
+            note=explained,
+        ),
+    )
+
+
+_position, _angle, _axis = (
+    _of_pose(function) for function in (metrics.position_error, metrics.geodesic_angle, metrics.axis_angle)
+)
+_VISUAL, _VISUAL_OBJECT, _TACTILE, _TACTILE_OBJECT = (
+    _image_metrics(stream, inside=inside) for stream in ("visual", "tactile") for inside in (False, True)
+)
 _millimetres = functools.partial(Metric, unit="mm", factor=1e3, digits=1)
 _degrees = functools.partial(Metric, unit="deg", factor=180 / np.pi, digits=0, interval=False)
-_ON_PAD = (
-    "Position is the distance between the predicted and the true position. On pad means that only trajectories count "
-    "whose object stays on the pad."
-)
-_ANGLE = "The angle is that of the rotation between the predicted and the true orientation."
-_AXIS = "The up axis is the z axis of the object. Its error is the angle between the predicted and the true axis."
+_AXIS_NOTE = "The up axis is the z axis of the object. Its error is the angle between the predicted and the true axis."
+LOG_LOSS, CALIBRATION = "outcome_log_loss", "outcome_calibration_error"  # names of metrics
 # In the order of the columns of the complete table. Values in summaries are in SI units.
 METRICS: tuple[Metric, ...] = (
-    Metric(
-        "visual_bce",
-        heading="visual BCE",
-        digits=4,
-        statistic=_image("visual", "bce"),
-        interval=False,
-        note="BCE is the binary cross-entropy of an image. BCE and excess are in nats per pixel and channel.",
-    ),
-    Metric(
-        "visual_excess",
-        heading="visual excess x1e-4",
-        factor=1e4,
-        digits=1,
-        statistic=_image("visual", "excess"),
-        interval=False,
-    ),
-    Metric(
-        "visual_skill",
-        statistic=_image("visual", "skill"),
-        compared="higher",
-        note="Excess is the cross-entropy of an image minus the entropy of the true image. Skill is 1 minus the ratio "
-        "of the excess to that of the constant prediction. With samples, it is the skill of their mean image.",
-    ),
-    Metric(
-        "visual_skill_object",
-        heading="visual skill on the object",
-        statistic=_image("visual_object", "skill"),
-        compared="higher",
-    ),
+    *_VISUAL,
+    _VISUAL_OBJECT[2],
     Metric(
         "visual_skill_best",
+        _best_errors,
         heading="visual skill, best sample",
-        statistic=_best,
+        reduce=_excess,
+        relative_to="visual_skill",
         note="The best sample of a trajectory is the one with the smallest visual excess. This choice uses the true "
         "image.",
     ),
     Metric(
         "sharpness",
+        _gradients,
         digits=2,
-        statistic=_sharpness,
+        reduce=lambda gradients, weight: metrics.ratio(gradients[:, 0], gradients[:, 1], weight),
         interval=False,
         note="Sharpness is the gradient energy of the visual samples divided by that of the true images. Gradient "
         "energy is the sum of the squared differences of neighbouring pixels.",
     ),
-    Metric("tactile_bce", heading="tactile BCE", digits=4, statistic=_image("tactile", "bce"), interval=False),
-    Metric(
-        "tactile_excess",
-        heading="tactile excess x1e-4",
-        factor=1e4,
-        digits=1,
-        statistic=_image("tactile", "excess"),
-        interval=False,
-    ),
-    Metric("tactile_skill", statistic=_image("tactile", "skill"), compared="higher"),
-    Metric(
-        "tactile_skill_object",
-        heading="tactile skill on the object",
-        statistic=_image("tactile_object", "skill"),
-        compared="higher",
-    ),
-    _millimetres("position", statistic=_of("position"), interval=False),
+    *_TACTILE,
+    _TACTILE_OBJECT[2],
+    _millimetres("position", _position, interval=False),
+    _millimetres("position_median", _position, heading="position, median", reduce=metrics.median, interval=False),
     _millimetres(
-        "position_median", heading="position, median", statistic=_of("position", metrics.median), interval=False
+        "position_on_pad",
+        _position,
+        items=_stays,
+        compared="lower",
+        note="Position is the distance between the predicted and the true position. On pad means that only "
+        "trajectories count whose object stays on the pad.",
     ),
-    _millimetres("position_on_pad", statistic=_of("position", on_pad=True), compared="lower", note=_ON_PAD),
     _millimetres(
         "position_on_pad_median",
+        _position,
         heading="position on pad, median",
-        statistic=_of("position", metrics.median, on_pad=True),
+        reduce=metrics.median,
+        items=_stays,
     ),
     _millimetres(
         "energy",
+        _energy,
         heading="energy score",
-        statistic=_of("energy"),
         compared="lower",
         note="The energy score of the position is the mean distance of the samples from the true position, minus half "
         "their mean distance from each other. For a single predicted position, it is the error.",
     ),
     Metric(
         "coverage",
+        _coverage,
         heading=f"coverage of {100 * metrics.LEVEL:g} %",
-        statistic=_of("coverage"),
         note=f"Coverage is the share of the true positions in the central {100 * metrics.LEVEL:g} % region of the "
         f"samples. It is {metrics.LEVEL:g} for calibrated predictions.",
     ),
-    _degrees("angle", statistic=_of("angle"), note=_ANGLE),
-    _degrees("angle_on_pad", statistic=_of("angle", on_pad=True)),
-    _degrees("axis", heading="up axis", statistic=_of("axis"), note=_AXIS),
-    _degrees(
-        "axis_on_pad",
-        heading="up axis on pad",
-        statistic=_of("axis", on_pad=True),
-        compared="lower",
-        note=_AXIS,
-    ),
-    _degrees(
-        "axis_on_pad_median",
-        heading="up axis on pad, median",
-        statistic=_of("axis", metrics.median, on_pad=True),
-    ),
+    _degrees("angle", _angle, note="The angle is that of the rotation between the predicted and the true orientation."),
+    _degrees("angle_on_pad", _angle, items=_stays),
+    _degrees("axis", _axis, heading="up axis", note=_AXIS_NOTE),
+    _degrees("axis_on_pad", _axis, heading="up axis on pad", items=_stays, compared="lower", note=_AXIS_NOTE),
+    _degrees("axis_on_pad_median", _axis, heading="up axis on pad, median", reduce=metrics.median, items=_stays),
     Metric(
         "outcome_balanced_accuracy",
+        _outcomes,
         heading="outcome, balanced accuracy",
-        statistic=_accuracy,
+        reduce=lambda outcome, weight: metrics.balanced_accuracy(outcome[:, 0], outcome[:, 1], weight),
         note="Balanced accuracy is the mean, over the outcomes, of the share of their trajectories that are predicted "
         "correctly.",
     ),
     Metric(
-        "outcome_log_loss",
+        LOG_LOSS,
+        _log_loss,
         heading="log loss",
         unit="nats",
-        statistic=_of("log_loss"),
         compared="lower",
         note="The log loss is minus the logarithm of the predicted probability of the true outcome. Probabilities "
         f"below {metrics.FLOOR} count as {metrics.FLOOR}.",
     ),
     Metric(
-        "outcome_calibration_error",
+        CALIBRATION,
+        _confidence,
         heading="calibration error",
-        statistic=_calibration,
+        reduce=lambda judged, weight: metrics.calibration_error(judged[:, 0], judged[:, 1], weight),
         interval=False,
         note="The calibration error is the mean difference between the probability of the likeliest outcome and its "
         f"frequency, in {metrics.BINS} bins of equal width.",
     ),
     Metric(
         "fell_off_auc",
+        _falls,
         heading="ROC area of falling off",
-        statistic=_auc,
+        reduce=lambda falls, weight: metrics.auc(falls[:, 1] > 0, falls[:, 0], weight),
         note="The ROC area is the probability that an object that falls off has a higher predicted probability of "
         "falling off than one that stays.",
     ),
-    *(
-        Metric(f"{stream}_{kind}_object", statistic=_image(f"{stream}_object", kind), column=False)
-        for stream in ("visual", "tactile")
-        for kind in ("bce", "excess")
-    ),
+    *_VISUAL_OBJECT[:2],
+    *_TACTILE_OBJECT[:2],
 )
 
 
 def _brief(name: str, digits: int, *, interval: bool = False) -> Metric:
     """A metric of METRICS as `table` shows it, with other decimals and with or without its interval."""
-    known = {metric.name: metric for metric in METRICS}
-    return dataclasses.replace(known[name], digits=digits, interval=interval)
+    (metric,) = (metric for metric in METRICS if metric.name == name)
+    return dataclasses.replace(metric, digits=digits, interval=interval)
 
 
 COLUMNS: tuple[Column, ...] = (  # default columns of `table`

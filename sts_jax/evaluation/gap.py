@@ -1,11 +1,8 @@
 """Distances between real and simulated images: per pixel, in a feature space, and by a classifier.
 
-The distances compare a set of real images with a set of simulated images. Images are uint8 `(n, height, width, 3)`.
-All images of a comparison are visual images, or all are tactile images. Each image has a group number, which is the
-number of its trajectory.
-
-The two sets are matched if both contain the same groups. In matched sets, image i of the real set and image i of the
-simulated set must show the same object in the same pose. Sets that are not matched must have no group in common.
+All images of a comparison are visual images, or all are tactile images, uint8 `(n, height, width, 3)`. Each has a group
+number, which is the number of its trajectory. The two sets either have no group in common, or they are matched: both
+contain the same groups, and image i of both sets shows the same object in the same pose.
 """
 
 from typing import NamedTuple
@@ -13,7 +10,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sts_jax.evaluation import intervals
+from sts_jax.evaluation.metrics import bootstrap, interval
 
 LEVELS = 3  # number of scales of the features, each with half the resolution of the previous one
 CELLS = 4  # number of cells of the features along each side of the image
@@ -34,15 +31,15 @@ class Streams(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """A value with its 95 % bootstrap interval. The bootstrap draws whole trajectories with replacement."""
+    """A value with its 95 % interval, from a bootstrap that draws whole trajectories."""
 
     value: float
-    low: float  # lower limit of the interval
-    high: float  # upper limit of the interval
+    low: float
+    high: float
 
 
 class PixelErrors(NamedTuple):
-    """Differences between real and simulated images that show the same object in the same pose."""
+    """Differences between real and simulated images of matched sets."""
 
     mae: Estimate  # mean absolute error, in grey levels of 8-bit images (0 to 255)
     rmse: Estimate  # root of the mean squared error, in grey levels of 8-bit images (0 to 255)
@@ -58,25 +55,18 @@ class Distance(NamedTuple):
 
 
 def pixel_errors(real: np.ndarray, simulated: np.ndarray, group: np.ndarray) -> PixelErrors:
-    """Compute the MAE, RMSE, PSNR and SSIM between real and simulated images of the same objects in the same poses.
-
-    Each value has a 95 % interval from a bootstrap that draws whole trajectories with replacement.
+    """Compute the MAE, RMSE, PSNR and SSIM between real and simulated images of matched sets.
 
     Args:
         real: Real images, uint8 `(n, height, width, 3)`.
-        simulated: Simulated images of the same shape. Image i shows the same object in the same pose as `real[i]`.
-        group: Number of the trajectory that contains image i, int `(n,)`.
-
-    Raises:
-        ValueError: The images are not uint8, n is 0, the shapes of `real` and `simulated` differ, or the length of
-            `group` is not n.
+        simulated: Simulated images of the same shape.
+        group: Number of the trajectory of each image, int `(n,)`.
     """
-    _check(real, simulated, group, group)
+    for name, images in (("real", real), ("simulated", simulated)):
+        if images.dtype != np.uint8:
+            raise ValueError(f"{name} must be uint8, got {images.dtype}")
     if real.shape != simulated.shape:
-        raise ValueError(
-            f"the arrays real and simulated must have equal shapes, got {real.shape} and {simulated.shape}: give one "
-            "simulated image of the same resolution for each real image"
-        )
+        raise ValueError(f"real and simulated must have equal shapes, got {real.shape} and {simulated.shape}")
     each = np.array([_differences(a, b) for a, b in zip(real, simulated, strict=True)])
 
     def summary(weight: np.ndarray) -> np.ndarray:
@@ -85,7 +75,7 @@ def pixel_errors(real: np.ndarray, simulated: np.ndarray, group: np.ndarray) -> 
         with np.errstate(divide="ignore"):
             return np.array([mae, rmse, 20 * np.log10(255 / rmse), ssim])
 
-    draws = intervals.bootstrap(group, summary)
+    draws = bootstrap(group, summary)
     values = summary(np.ones(len(group)))
     return PixelErrors(*(_estimate(value, column) for value, column in zip(values, draws.T, strict=True)))
 
@@ -93,30 +83,21 @@ def pixel_errors(real: np.ndarray, simulated: np.ndarray, group: np.ndarray) -> 
 def features(images: np.ndarray) -> np.ndarray:
     """Compute colours and oriented gradients in the cells of a 4 x 4 grid on each image, without a neural network.
 
-    A cell has two kinds of features. The colours are the means of the three channels. The gradients are the mean
-    absolute differences of neighbouring pixels of the grey image, in four directions (horizontal, vertical and both
-    diagonals) and at three scales. Brightness, vignetting and tint affect the colours. Noise, blur, edges and texture
-    affect the gradients.
+    The colours are the means of the three channels in a cell. The gradients are the mean absolute differences of
+    neighbouring pixels of the grey image, in four directions (horizontal, vertical and both diagonals) and at three
+    scales. Brightness, vignetting and tint affect the colours. Noise, blur, edges and texture affect the gradients.
 
     Args:
         images: Images, uint8 `(n, height, width, 3)`, at least 64 pixels high and wide.
 
     Returns:
-        Features in [0, 1], `(n, 240)`. The first 48 are the colours (16 cells, 3 channels). They are followed by the
-        gradients (16 cells, 4 directions) of the finest scale, of the middle one and of the coarsest one.
-
-    Raises:
-        ValueError: The images are not uint8 or are smaller than 64 pixels.
+        Features in [0, 1], `(n, 240)`: 48 colours (16 cells, 3 channels), then the gradients (16 cells, 4 directions)
+        from the finest to the coarsest scale.
     """
-    if images.dtype != np.uint8 or images.ndim != 4 or images.shape[3] != 3:
-        raise ValueError(
-            f"images must be uint8 of shape (n, height, width, 3), got {images.dtype} of shape {images.shape}"
-        )
+    if images.dtype != np.uint8:
+        raise ValueError(f"images must be uint8, got {images.dtype}")
     if min(images.shape[1:3]) < LEAST_SIDE:
-        raise ValueError(
-            f"images must be at least {LEAST_SIDE} pixels high and wide, got {images.shape[1]} x {images.shape[2]}: "
-            "give a larger resolution"
-        )
+        raise ValueError(f"images must be at least {LEAST_SIDE} pixels high and wide, got {images.shape[1:3]}")
     return np.stack([_described(image) for image in images])
 
 
@@ -126,18 +107,13 @@ def energy_distance(
     """Compute the normalised energy distance of two sets of features, and test whether their distributions differ.
 
     The distance is `1 - (E|X - X'| + E|Y - Y'|) / (2 E|X - Y|)`. X and X' are the features of two real images, and Y
-    and Y' are those of two simulated images. E is the mean over pairs of images, and `|.|` is the Euclidean norm. The
-    distance is 0 for equal distributions and 1 for sets that are far apart. Each feature is first divided by its
-    standard deviation over both sets. If this deviation is below one grey level (1/255), the feature is divided by one
-    grey level instead.
+    and Y' are those of two simulated images. E is the mean over pairs of images of different trajectories, so the
+    estimate has no bias: for equal distributions, it varies around 0 and may be negative. It is 1 for sets that are far
+    apart. Each feature is first divided by its standard deviation over both sets, or by one grey level (1/255) if the
+    deviation is smaller.
 
-    The three means use only pairs of images from different trajectories. An image is therefore never paired with
-    itself, so the estimate has no bias that depends on the number of images. Trajectories that occur in both sets also
-    cause no bias. For equal distributions, the estimate varies around 0 and may be negative.
-
-    The test is a permutation test, and its p-value is a part of the result. If both sets have the same trajectories, a
-    permutation exchanges the real and the simulated images of randomly selected trajectories. If they have no common
-    trajectory, a permutation distributes the trajectories to the two sets at random.
+    A permutation of the test exchanges the real and the simulated images of random trajectories in matched sets. In
+    other sets, it distributes the trajectories to the two sets at random.
 
     Args:
         real: Features of the real images, from `features`, `(n, k)`.
@@ -145,11 +121,6 @@ def energy_distance(
         real_group: Number of the trajectory of each real image, int `(n,)`.
         simulated_group: Number of the trajectory of each simulated image, int `(m,)`.
         seed: Seed of the permutations.
-
-    Raises:
-        ValueError: A value is not finite, a shape is wrong, or a set has images of fewer than 2 trajectories. The error
-            is also raised if only some of the trajectories occur in both sets, or if all trajectories occur in both
-            sets but `real` and `simulated` have different lengths.
 
     Source: Szekely and Rizzo (2013), Energy statistics: a class of statistics based on distances.
     """
@@ -183,26 +154,12 @@ def told_apart(
 ) -> Estimate:
     """Compute the cross-validated accuracy of a classifier that distinguishes real from simulated images.
 
-    The classifier is a logistic regression on standardised features. The classifier is tested in five
-    cross-validations of five folds. All real and simulated images of a trajectory are in the same fold. The classifier
-    is therefore never tested on a trajectory to which it was fitted.
+    The classifier is a logistic regression on standardised features, in five cross-validations of five folds. All
+    images of a trajectory are in the same fold. The accuracy is the mean of the accuracies for real and for simulated
+    images, so 0.5 is chance. The bootstrap of its interval does not fit the classifier again, so the interval does not
+    include the variation between training sets.
 
-    The share of correctly classified images is computed for the real and for the simulated images, and each share is
-    averaged over the five cross-validations. The accuracy is the mean of these two shares, so 0.5 is chance. The 95 %
-    interval of the accuracy comes from a bootstrap, which draws tested trajectories with replacement. The bootstrap
-    does not fit the classifier again, so the interval does not include the variation between training sets.
-
-    Args:
-        real: Features of the real images, from `features`, `(n, k)`.
-        simulated: Features of the simulated images, `(m, k)`.
-        real_group: Number of the trajectory of each real image, int `(n,)`.
-        simulated_group: Number of the trajectory of each simulated image, int `(m,)`.
-
-    Raises:
-        ValueError: A value is not finite, a shape is wrong, or a set has images of fewer than 5 trajectories. The error
-            is also raised if only some of the trajectories occur in both sets, or if all trajectories occur in both
-            sets but `real` and `simulated` have different lengths.
-        ImportError: scikit-learn is not installed.
+    The arguments are those of `energy_distance`.
     """
     try:
         from sklearn.linear_model import LogisticRegression
@@ -211,9 +168,7 @@ def told_apart(
         from sklearn.preprocessing import StandardScaler
         from threadpoolctl import threadpool_limits
     except ImportError as error:
-        raise ImportError(
-            "the classifier needs the package scikit-learn, which is not installed: pip install -e '.[bench]'"
-        ) from error
+        raise ImportError("the classifier needs the package scikit-learn: pip install -e '.[bench]'") from error
     _matched(real, simulated, real_group, simulated_group, least=FOLDS)
     x, group = np.concatenate([real, simulated]), np.r_[real_group, simulated_group]
     is_real = np.arange(len(x)) < len(real)
@@ -232,7 +187,7 @@ def told_apart(
         shares = [(side * right).sum() / side.sum() if side.sum() else np.nan for side in sides]
         return np.asarray(np.mean(shares))
 
-    return _estimate(float(accuracy(np.ones(len(x)))), intervals.bootstrap(group, accuracy))
+    return _estimate(float(accuracy(np.ones(len(x)))), bootstrap(group, accuracy))
 
 
 def _differences(real: np.ndarray, simulated: np.ndarray) -> tuple[float, float, float]:
@@ -263,31 +218,11 @@ def _cells(values: np.ndarray) -> np.ndarray:
     return cv2.resize(values, (CELLS, CELLS), interpolation=cv2.INTER_AREA)
 
 
-def _check(real: np.ndarray, simulated: np.ndarray, real_group: np.ndarray, simulated_group: np.ndarray) -> None:
-    """Raise an error for invalid images and groups."""
-    for name, images, group in (("real", real, real_group), ("simulated", simulated, simulated_group)):
-        if images.dtype != np.uint8 or images.ndim != 4 or images.shape[3] != 3 or not len(images):
-            raise ValueError(
-                f"{name} must be uint8 of shape (n, height, width, 3) with n >= 1, got {images.dtype} of shape "
-                f"{images.shape}"
-            )
-        if group.shape != images.shape[:1]:
-            raise ValueError(
-                f"`group` must contain one trajectory number for each of the {len(images)} images in `{name}`, "
-                f"got shape {group.shape}"
-            )
-
-
 def _matched(
     real: np.ndarray, simulated: np.ndarray, real_group: np.ndarray, simulated_group: np.ndarray, *, least: int = 2
 ) -> bool:
     """Return whether the two sets are matched, or raise an error for invalid features and groups."""
     for name, values, group in (("real", real, real_group), ("simulated", simulated, simulated_group)):
-        if values.ndim != 2 or group.shape != values.shape[:1]:
-            raise ValueError(
-                f"{name} must have the shape (images, features) and {name}_group the shape (images,), "
-                f"got {values.shape} and {group.shape}"
-            )
         if not np.isfinite(values).all():
             raise ValueError(f"{name} must be finite, got {values[~np.isfinite(values)][0]}")
         if (number := len(np.unique(group))) < least:
@@ -299,15 +234,12 @@ def _matched(
         return False
     if set(common) != set(np.r_[real_group, simulated_group]) or len(real) != len(simulated):
         raise ValueError(
-            "the real and the simulated images must have either no common trajectory, or the same trajectories and the "
-            f"same number of images. Number of common trajectories: {len(common)}. Number of images: {len(real)} real, "
-            f"{len(simulated)} simulated. Keep only the images that have a counterpart in the other set, or give the "
-            "simulated images other trajectory numbers"
+            "the real and the simulated images must have no common trajectory, or the same trajectories and as many "
+            f"images, got {len(common)} common trajectories, {len(real)} real and {len(simulated)} simulated images"
         )
     return True
 
 
 def _estimate(value: float, draws: np.ndarray) -> Estimate:
-    """A value with the interval of its bootstrap values."""
     with np.errstate(invalid="ignore"):
-        return Estimate(float(value), *intervals.interval(draws))
+        return Estimate(float(value), *interval(draws))

@@ -1,10 +1,8 @@
 """Figures of predictions, training and simulation. Each function writes one file."""
 
-from sts_jax.evaluation.figures.curves import Trained, scaling, training_curves
-from sts_jax.evaluation.figures.grids import comparison
-from sts_jax.evaluation.figures.held_out import SAMPLES, calibration, ends, predictions
+from sts_jax.evaluation.figures.curves import Trained, calibration, ends, scaling, training_curves
 from sts_jax.evaluation.figures.motion import SLOWER, animation, strip
-from sts_jax.evaluation.figures.sides import side_by_side
+from sts_jax.evaluation.figures.pictures import SAMPLES, comparison, predictions, side_by_side
 
 __all__ = [
     "SAMPLES",

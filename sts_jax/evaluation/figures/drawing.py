@@ -1,4 +1,4 @@
-"""Functions that all figures use to draw images and to save files."""
+"""Functions that all figures use."""
 
 from pathlib import Path
 

@@ -1,17 +1,23 @@
-"""One trajectory over time, as a row of images and as an animation."""
+"""One trajectory over time: a view from outside, a row of images, and an animation."""
 
+import functools
 import tempfile
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
+from jaxtyping import Array, Float, ScalarLike
 from matplotlib.animation import FuncAnimation
 from matplotlib.axes import Axes
 from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
 from matplotlib.text import Annotation, Text
 
+from sts_jax import geometry, optics
 from sts_jax.evaluation.figures import drawing
+from sts_jax.objects import Body
 from sts_jax.storage import write_bytes
 
 SLOWER = 2  # duration of an animation divided by the duration of the motion
@@ -21,6 +27,67 @@ _DPI = 100  # pixels per inch of an animation
 _HOLD = 1500  # ms, duration of the last frame
 _REACH = 0.035  # s^2/m, length of the gravity arrow per unit of gravity, as a share of the image's side
 _VISIBLE = 0.1  # m/s^2, smallest component of gravity along the pad that has an arrow
+_THICKNESS = 0.012  # m, thickness of the box that is drawn as the housing of the sensor
+_PAD = np.float32([178, 178, 204]) / 255  # sRGB
+_HOUSING = np.float32([0.05, 0.05, 0.055])
+
+
+@functools.partial(jax.jit, static_argnames=("resolution",))
+def outside(
+    body: Body,
+    pose: Float[Array, "7"],
+    size: Float[Array, "2"],
+    up: Float[Array, "3"] | None = None,
+    wall: ScalarLike = 0.0,
+    *,
+    resolution: tuple[int, int] = (160, 160),
+) -> Float[Array, "h w 3"]:
+    """Render the object and the pad from outside, obliquely from above.
+
+    Args:
+        body: The object.
+        pose: Its pose.
+        size: Size of the pad along x and y (m).
+        up: Vector of any length that points upwards, in the sensor frame (default: the pad is level).
+        wall: Height of the stop wall at the edge of the pad with the largest y (m). 0 draws no wall.
+        resolution: Height h and width w of the image (pixels).
+
+    Returns:
+        Image, sRGB in [0, 1].
+    """
+    half = jnp.stack([size[0], size[1], jnp.float32(_THICKNESS)]) / 2
+    corners = jnp.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-2, 0)], jnp.float32)
+    quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+    box = jnp.asarray(np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]), jnp.int32)
+    thick = half[:2] + jnp.array([0.0, 0.003]) * (jnp.asarray(wall) > 0)
+    stop = jnp.stack(
+        [jnp.stack([x * half[0], y, z * wall]) for x in (-1, 1) for y in (half[1], thick[1]) for z in (0, 1)]
+    )
+    vertices = jnp.concatenate([geometry.transform(pose, body.vertices), corners * half, stop])
+    faces = jnp.concatenate([body.faces, box + len(body.vertices), box + len(body.vertices) + 8])
+    flat = jnp.array([[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1], [0, 0, 1]], jnp.float32)
+    flat = jnp.broadcast_to(jnp.tile(flat, (4, 1))[:, None], (24, 3, 3))
+    normals = jnp.concatenate([body.normals @ geometry.quat_to_matrix(pose[3:]).T, flat])
+    top = (flat[..., 2:] > 0) & (jnp.arange(24) < 12)[:, None, None]
+    if up is not None:
+        axis, along = jnp.cross(up, jnp.array([0.0, 0.0, 1.0])), geometry.norm(up)
+        level = geometry.quat_from_rotvec(
+            geometry.normalize(axis) * jnp.arctan2(geometry.norm(axis) / along, up[2] / along)
+        )
+        vertices, normals = (x @ geometry.quat_to_matrix(level).T for x in (vertices, normals))
+    albedo = body.colors * optics.sample_texture(body.texture, body.uv)
+    albedo = jnp.concatenate([albedo, jnp.where(top, optics.to_linear(jnp.asarray(_PAD)), jnp.asarray(_HOUSING))])
+    return optics.photograph(
+        vertices,
+        faces,
+        normals,
+        albedo,
+        eye=jnp.array([0.25, 0.53, 0.38]),
+        target=jnp.array([0.0, 0.0, 0.03]),
+        fov=0.44,
+        resolution=resolution,
+        two_sided=body.two_sided,
+    )
 
 
 def strip(
@@ -36,18 +103,14 @@ def strip(
 ) -> None:
     """Draw one trajectory over time: a view from outside, the visual and tactile images, and the wrench.
 
-    Two plots below the images show the force of the pad on the object and its moment about the sensor's origin.
-
     Args:
         path: The PNG file to write.
         time: Times of the frames (s), `(frames,)`.
-        view: Images of the scene from outside, in [0, 1], `(frames, h, w, 3)`.
+        view: Images of `outside`, in [0, 1], `(frames, h, w, 3)`.
         visual: Images of the visual stream, in [0, 1], `(frames, height, width, 3)`.
         tactile: Images of the tactile stream, in [0, 1], `(frames, height, width, 3)`.
-        wrench: Force (N) and moment about the sensor's origin (N m) of the pad on the object in each frame,
-            `(frames, 6)`.
-        num: Number of frames whose images are drawn. These frames range from the first to the last one and are denser
-            at the beginning. Fewer frames are drawn for a short trajectory, because no frame is drawn twice.
+        wrench: Wrench in each frame (N, N m), `(frames, 6)`.
+        num: Number of frames whose images are drawn, denser at the beginning, and fewer for a short trajectory.
         title: Title of the figure.
     """
     last = len(time) - 1
@@ -98,20 +161,17 @@ def animation(
 ) -> None:
     """Write an animation of one trajectory: a view from outside, the visual and tactile images, and the wrench.
 
-    Curves below the images show the wrench from the first to the current frame. A red arrow on the visual stream shows
-    the component of `gravity` along the pad. The arrow appears if the pad slopes or accelerates. The animation runs at
-    half the speed of the motion (the constant `SLOWER` is 2).
+    Curves below the images show the wrench up to the current frame. A red arrow on the visual stream shows the
+    component of `gravity` along the pad. The animation runs at half the speed of the motion (`SLOWER` is 2).
 
     Args:
         path: The GIF file to write.
         time: Times of the frames (s), `(frames,)`.
-        view: Images of the scene from outside, in [0, 1], `(frames, h, w, 3)`.
+        view: Images of `outside`, in [0, 1], `(frames, h, w, 3)`.
         visual: Images of the visual stream, in [0, 1], `(frames, height, width, 3)`.
         tactile: Images of the tactile stream, in [0, 1], `(frames, height, width, 3)`.
-        wrench: Force (N) and moment about the sensor's origin (N m) of the pad on the object in each frame,
-            `(frames, 6)`.
-        gravity: Gravity minus the acceleration of the pad (m/s^2) at each time of `time`, in the coordinates of the
-            sensor, `(frames, 3)`.
+        wrench: Wrench in each frame (N, N m), `(frames, 6)`.
+        gravity: Gravity minus the acceleration of the pad in the sensor frame (m/s^2), `(frames, 3)`.
         title: Title above the images.
         outcome: Text above the images in the last frame, such as `fell off`.
         side: Side of each of the three images (pixels).

@@ -1,0 +1,160 @@
+"""Figures of images in rows and columns. Each function writes one file."""
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+
+from sts_jax import physics
+from sts_jax.dataset import Pairs
+from sts_jax.evaluation.figures import drawing
+from sts_jax.evaluation.gap import Streams
+from sts_jax.evaluation.predictions import OUTCOMES, Predicted, in_unit, named
+
+SAMPLES = 4  # number of samples that are shown for each prediction
+_PERCENTILE = 99.5  # percentile of the absolute differences at which their colour scale ends
+
+
+def predictions(
+    path: Path,
+    test: Pairs,
+    predicted: Predicted,
+    *,
+    num: int,
+    title: str,
+    scenario: physics.Scenario | None = None,
+) -> None:
+    """Draw the first image, the true last image, the prediction and its samples for some held-out trajectories.
+
+    A red arrow on the first image shows `Scenario.drift`, the velocity of a frictionless object relative to the pad. An
+    arrow for 1 m/s is as long as a quarter of the image's width.
+
+    Args:
+        path: The PNG file to write.
+        test: The held-out trajectories.
+        predicted: Predictions for all trajectories of `test`, or for the first ones.
+        num: Maximum number of trajectories in the figure.
+        title: Title of the figure.
+        scenario: The scenario, for the arrows and the names of the outcomes. None: no arrows, and the names of
+            `physics.Outcome`.
+    """
+    streams = [name for name in ("visual", "tactile") if getattr(predicted, name) is not None]
+    samples, outcomes = predicted.samples or Predicted(), OUTCOMES if scenario is None else scenario.outcomes
+    num = min(num, *(len(getattr(predicted, name)) for name in streams))
+    drawn = 0 if samples.visual is None and samples.tactile is None else SAMPLES
+    heads = ["input", "truth", "mean of samples" if drawn else "prediction", *(f"sample {k + 1}" for k in range(drawn))]
+    rows = len(streams) * num
+    drift = np.zeros((num, 2))
+    if scenario is not None:
+        drift = np.stack([scenario.drift(jnp.asarray(condition)) for condition in test.condition[:num]])
+    figure, axes = plt.subplots(rows, len(heads), figsize=(1.25 * len(heads) + 0.7, 1.25 * rows + 0.8), squeeze=False)
+    for row in range(rows):
+        item, stream = row // len(streams), streams[row % len(streams)]
+        truth, drawings = getattr(test, stream)[item], getattr(samples, stream)
+        pictures = [truth[0], truth[1], getattr(predicted, stream)[item]]
+        pictures += [] if drawings is None else list(drawings[:SAMPLES, item])
+        for column, axis in enumerate(axes[row]):
+            if column < len(pictures):
+                drawing.show(axis, in_unit(pictures[column]))
+            else:
+                axis.axis("off")
+            if row == 0:
+                axis.set_title(heads[column], fontsize=10)
+        label = stream
+        if row % len(streams) == 0:
+            outcome = named(int(test.outcome[item]), outcomes).replace("_", " ")
+            label = f"#{test.trajectory[item]}: {outcome}\n{stream}"
+        axes[row, 0].set_ylabel(label, fontsize=9)
+        if stream == streams[0] and drift[item].any():
+            height, width = test.visual.shape[2:4]
+            middle = np.array([width - 1, height - 1]) / 2
+            tip = middle + drift[item] * width / 4
+            axes[row, 0].annotate("", tip, middle, arrowprops={"arrowstyle": "->", "color": "red"})
+    arrows = "\nred arrow: velocity over the pad that a freely sliding object receives" if drift.any() else ""
+    wrapped = textwrap.fill(title, int(11 * figure.get_figwidth()))  # about eleven letters fit into an inch
+    figure.suptitle(wrapped + arrows, fontsize=11)
+    drawing.save(figure, path)
+
+
+def comparison(
+    path: Path, groups: Sequence[Mapping[str, np.ndarray]], labels: Sequence[str], *, title: str, heads: Sequence[str]
+) -> None:
+    """Draw images of n trajectories as a grid. Each trajectory is a row, and neighbouring columns form groups.
+
+    Args:
+        path: The PNG file to write.
+        groups: Images `(n, height, width, 3)` in [0, 1] by the title of their column, for each group from left to
+            right.
+        labels: Labels of the n rows.
+        title: Title of the figure.
+        heads: Titles of the groups.
+    """
+    rows, widths = len(labels), [len(group) for group in groups]
+    figure = plt.figure(figsize=(1.5 * sum(widths) + 0.8, 1.42 * rows + 1.3))
+    parts = figure.subfigures(1, len(groups), width_ratios=widths, squeeze=False)[0]
+    for number, (part, group, head) in enumerate(zip(parts, groups, heads, strict=True)):
+        part.suptitle(head, fontsize=11, fontweight="bold")
+        axes = part.subplots(rows, len(group), squeeze=False)
+        for column, (name, images) in enumerate(group.items()):
+            axes[0, column].set_title(name, fontsize=9)
+            for row in range(rows):
+                drawing.show(axes[row, column], images[row])
+        if number == 0:
+            for row, label in enumerate(labels):
+                axes[row, 0].set_ylabel(label, fontsize=9)
+    figure.suptitle(title, fontsize=11)
+    drawing.save(figure, path)
+
+
+def side_by_side(
+    path: Path,
+    real: Streams,
+    simulated: Streams,
+    labels: Sequence[str],
+    *,
+    matched: bool,
+    title: str,
+    names: tuple[str, str] = ("real", "simulated"),
+) -> None:
+    """Draw real and simulated images of both streams side by side, and for matched sets their differences.
+
+    A difference (real minus simulated, averaged over the colour channels) is red where the real image is brighter.
+
+    Args:
+        path: The PNG file to write.
+        real: Real images, one for each row.
+        simulated: Simulated images of the same shape.
+        labels: Labels of the rows.
+        matched: True if the images of each row show the same object in the same pose.
+        title: Title of the figure.
+        names: Titles of the columns of real and simulated images.
+    """
+    rows, kinds = len(labels), 3 if matched else 2
+    figure, grid = plt.subplots(
+        rows, 2 * kinds, figsize=(1.75 * 2 * kinds + 0.4, 1.36 * rows + 1.3), squeeze=False, layout="constrained"
+    )
+    for place, stream in enumerate(("visual", "tactile")):
+        axes = grid[:, place * kinds : (place + 1) * kinds]
+        first, second = getattr(real, stream), getattr(simulated, stream)
+        difference = (first.astype(np.float64) - second).mean(-1)
+        reach = max(float(np.percentile(np.abs(difference), _PERCENTILE)), 1.0)
+        for row in range(rows):
+            drawing.show(axes[row, 0], first[row] / 255)
+            drawing.show(axes[row, 1], second[row] / 255)
+            if matched:
+                drawn = axes[row, 2].imshow(difference[row], cmap="RdBu_r", vmin=-reach, vmax=reach)
+                axes[row, 2].set_xticks([])
+                axes[row, 2].set_yticks([])
+        for axis, name in zip(axes[0], (*names, "difference"), strict=False):
+            axis.set_title(f"{stream}:\n{name}", fontsize=10)
+        if matched:
+            bar = figure.colorbar(drawn, ax=axes[:, 2], location="bottom", shrink=0.95, aspect=14, pad=0.02)
+            bar.set_label("grey levels (of 255)", fontsize=8)
+            bar.ax.tick_params(labelsize=8)
+    for axis, label in zip(grid[:, 0], labels, strict=True):
+        axis.set_ylabel(label, fontsize=9)
+    figure.suptitle(title, fontsize=11)
+    drawing.save(figure, path)

@@ -1,0 +1,328 @@
+"""The table of results: `score` computes errors, `summarise` metrics with intervals, and `table` shows them."""
+
+import enum
+import functools
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from sts_jax import physics
+from sts_jax.dataset import Pairs
+from sts_jax.evaluation.catalogue import COLUMNS, LOG_LOSS, METRICS, Column, Metric, Scores
+from sts_jax.evaluation.metrics import bootstrap, interval, skill
+from sts_jax.evaluation.predictions import OUTCOMES, Predicted, named
+from sts_jax.evaluation.predictions import frequency as frequency_of
+from sts_jax.evaluation.references import BASELINES, CEILINGS, CONSTANT
+
+
+def score(
+    predicted: Predicted,
+    test: Pairs,
+    *,
+    outcomes: Sequence[enum.IntEnum] = (),
+    frequency: np.ndarray | None = None,
+    metrics: Sequence[Metric] = METRICS,
+) -> Scores:
+    """Compute the errors of a prediction for each held-out trajectory (item).
+
+    With outcome probabilities and `frequency`, the predicted outcome is the one with the largest ratio of probability
+    to frequency. This choice has the best expected balanced accuracy, in which a rare outcome counts as much as a
+    common one.
+
+    Args:
+        predicted: The prediction of all items, or of the first ones only.
+        test: The held-out items.
+        outcomes: The outcomes of the scenario, `scenario.outcomes`, for predictions with `outcome_probability`.
+        frequency: Frequency of each outcome among the training trajectories, `(c,)`, from `evaluation.frequency`. If it
+            is None, the predicted outcome is `predicted.outcome`, or else the likeliest outcome.
+        metrics: The metrics of the evaluation.
+
+    Returns:
+        The results of `Metric.errors` for the predicted items, by the name of the metric. Metrics of quantities that
+        are not predicted are missing.
+    """
+    leaves = (
+        *(predicted.visual, predicted.tactile, predicted.pose, predicted.outcome, predicted.outcome_probability),
+        *(predicted.measurements or {}).values(),
+    )
+    test = test.take(slice(next((len(leaf) for leaf in leaves if leaf is not None), len(test.object))))
+    items = len(test.object)
+    if predicted.outcome_probability is not None:
+        predicted = _decided(predicted, items, outcomes, frequency)
+    errors = {metric.errors: metric.errors(predicted, test) for metric in metrics}
+    scores = {}
+    for metric in metrics:
+        values = errors[metric.errors]
+        if values is None:
+            continue
+        scores[metric.name] = np.asarray(values)
+        if scores[metric.name].shape[:1] != (items,) or scores[metric.name].ndim > 2:
+            raise ValueError(
+                f"metric {metric.name!r}: its function `errors` returned an array of shape "
+                f"{scores[metric.name].shape}, but it must be ({items},) or ({items}, k), with a row for each item"
+            )
+    return scores
+
+
+def scorer(
+    scenario: physics.Scenario, train: Pairs, *, metrics: Sequence[Metric] = METRICS
+) -> Callable[[Predicted, Pairs], Scores]:
+    """Return `score` as a function of a prediction and the held-out items.
+
+    The outcomes are those of the scenario, with their frequencies in the training set.
+    """
+    frequencies = frequency_of(train.outcome, scenario.outcomes)
+    return functools.partial(score, outcomes=scenario.outcomes, frequency=frequencies, metrics=metrics)
+
+
+def _decided(
+    predicted: Predicted, items: int, outcomes: Sequence[enum.IntEnum], frequency: np.ndarray | None
+) -> Predicted:
+    """Add the predicted outcome and the outcomes of the columns of `outcome_probability`."""
+    probability, numbers = predicted.outcome_probability, np.array([int(outcome) for outcome in outcomes])
+    assert probability is not None
+    if probability.shape != (items, len(outcomes)):
+        raise ValueError(
+            f"outcome_probability has shape {probability.shape}, but it must have shape {(items, len(outcomes))}: "
+            "pass the items that were predicted, and outcomes=scenario.outcomes"
+        )
+    outcome = predicted.outcome
+    if frequency is not None:
+        outcome = numbers[(probability / frequency).argmax(1)]
+    elif outcome is None:
+        outcome = numbers[probability.argmax(1)]
+    return predicted._replace(outcome=outcome, outcomes=numbers)
+
+
+def summarise(
+    scores: Mapping[str, Scores],
+    test: Pairs,
+    *,
+    metrics: Sequence[Metric] = METRICS,
+    outcomes: Sequence[enum.IntEnum] = OUTCOMES,
+    num: int = 2000,
+    seed: int = 0,
+) -> dict:
+    """Compute all metrics of all predictors, and their differences from the baselines.
+
+    Args:
+        scores: Scores by predictor, including those of `evaluation.baselines`. A predictor may have scores of the first
+            items only. Its metrics are then computed from these items.
+        test: The held-out trajectories (items) that were scored.
+        metrics: The metrics, the same as for `score`.
+        outcomes: The outcomes of the scenario, `scenario.outcomes`, for their names.
+        num: Number of bootstrap samples.
+        seed: Seed of the bootstrap.
+
+    Returns:
+        A dictionary that can be written as JSON, with the following entries. Each metric is a dictionary of `value` and
+        of the limits `low` and `high` of its 95 % bootstrap interval over objects, or None if the predictor does not
+        have the metric.
+
+        - `items`: Number of items.
+        - `objects`: Number of different objects among the items.
+        - `outcomes`: Number of items with each true outcome, by its name.
+        - `scored`: Number of items that were scored, by predictor.
+        - `predictors`: The metrics, by predictor and name of the metric.
+        - `differences`: The metrics of each model minus those of each baseline, by model, baseline and name of the
+            metric. Predictors from `evaluation.baselines` and `evaluation.ceiling` are not models.
+    """
+    keys = [metric.name for metric in metrics]
+    for key in keys:
+        if keys.count(key) > 1:
+            raise ValueError(f"metrics has more than one metric named {key!r}: give each metric its own name")
+    missing = [name for name in BASELINES if name not in scores]
+    if missing:
+        raise ValueError(
+            f"`scores` lacks {' and '.join(map(repr, missing))}: add the scores of the predictions of "
+            "evaluation.baselines"
+        )
+    items = len(test.object)
+    scored = {name: len(next(iter(of_predictor.values()), test.object)) for name, of_predictor in scores.items()}
+    statistics = [
+        [_statistic(metric, of_predictor, scores[CONSTANT], test.take(slice(scored[name]))) for metric in metrics]
+        for name, of_predictor in scores.items()
+    ]
+
+    def numbers(weight: np.ndarray) -> np.ndarray:
+        """All metrics, `(predictors, metrics)`, for weights of the items. NaN if a predictor lacks the metric."""
+        rows = [
+            [np.nan if statistic is None else statistic(weight[:count]) for statistic in row]
+            for row, count in zip(statistics, scored.values(), strict=True)
+        ]
+        return np.array(rows)
+
+    value = numbers(np.ones(items))
+    draws = bootstrap(test.object, numbers, num=num, seed=seed)
+
+    def cells(values: np.ndarray, sample: np.ndarray) -> dict:
+        return {key: _cell(values[k], sample[:, k]) for k, key in enumerate(keys)}
+
+    names = list(scores)
+    reference = {name: names.index(name) for name in BASELINES}
+    return {
+        "items": items,
+        "objects": len(np.unique(test.object)),
+        "outcomes": {named(int(o), outcomes): int((test.outcome == o).sum()) for o in np.unique(test.outcome)},
+        "scored": scored,
+        "predictors": {name: cells(value[i], draws[:, i]) for i, name in enumerate(names)},
+        "differences": {
+            name: {base: cells(value[i] - value[j], draws[:, i] - draws[:, j]) for base, j in reference.items()}
+            for i, name in enumerate(names)
+            if name not in (*reference, *CEILINGS)
+        },
+    }
+
+
+def _statistic(metric: Metric, scores: Scores, constant: Scores, test: Pairs) -> Callable[[np.ndarray], float] | None:
+    """The metric of a predictor as a function of the weights of its items, or None if the predictor lacks it."""
+    values, reference = scores.get(metric.name), None
+    if values is None:
+        return None
+    items = slice(None) if metric.items is None else metric.items(test)
+    if metric.relative_to is not None:
+        if metric.relative_to not in constant:
+            return None
+        reference = constant[metric.relative_to][: len(values)][items]
+    values = values[items]
+
+    def statistic(weight: np.ndarray) -> float:
+        value = metric.reduce(values, weight[items])
+        if reference is None:
+            return value
+        whole = metric.reduce(reference, weight[items])
+        return 1 - value / whole if whole > 0 else np.nan
+
+    return statistic
+
+
+def gain(
+    before: Scores, after: Scores, test: Pairs, *, metric: str = LOG_LOSS, num: int = 2000, seed: int = 0
+) -> dict | None:
+    """Compute the relative reduction `1 - b / a` of a mean error from one predictor (a) to another (b).
+
+    Args:
+        before: Scores of the first predictor, for instance from vision.
+        after: Scores of the second predictor, for instance from vision and touch.
+        test: The held-out trajectories that were scored.
+        metric: Name of a metric that is a mean of its errors. The default is the log loss of the outcome.
+        num: Number of bootstrap samples over objects.
+        seed: Seed of the bootstrap.
+
+    Returns:
+        A dictionary of `value` and of the limits `low` and `high` of its 95 % interval, or None if a predictor lacks
+        the metric or the reduction is not finite.
+    """
+    if metric not in before or metric not in after:
+        return None
+
+    def statistic(weight: np.ndarray) -> np.ndarray:
+        return np.asarray(skill(after[metric], before[metric], weight))
+
+    value = float(statistic(np.ones(len(before[metric]))))
+    return _cell(value, bootstrap(test.object, statistic, num=num, seed=seed))
+
+
+def _cell(number: float, sample: np.ndarray) -> dict | None:
+    """A value and its interval from bootstrap samples, or None if the value is not finite."""
+    if not np.isfinite(number):
+        return None
+    low, high = interval(sample)
+    return {"value": float(number), "low": low, "high": high}
+
+
+def table(
+    summary: dict,
+    *,
+    title: str,
+    rows: Sequence[str] | None = None,
+    notes: Sequence[str] = (),
+    columns: Sequence[Column] = COLUMNS,
+) -> str:
+    """Format the main metrics as a Markdown table, below a title and an explanation of the metrics.
+
+    Args:
+        summary: The result of `summarise`.
+        title: Heading above the table.
+        rows: Names of the predictors, in the order of the rows (default: all).
+        notes: Lines below the table.
+        columns: The columns of metrics, from left to right.
+    """
+    lines = _head(["predictor", *(column.heading for column in columns)])
+    for name in summary["predictors"] if rows is None else rows:
+        cells = [
+            [_shown(summary["predictors"][name], metric, interval=metric.interval) for metric in column.metrics]
+            for column in columns
+        ]
+        lines.append(_row([name, *("-" if set(cell) == {"-"} else " / ".join(cell) for cell in cells)]))
+    return _page(summary, title, [metric for column in columns for metric in column.metrics], lines, notes)
+
+
+def full_table(summary: dict, *, title: str, notes: Sequence[str] = (), metrics: Sequence[Metric] = METRICS) -> str:
+    """Format all metrics as a Markdown table, followed by a table of the differences from the baselines.
+
+    Args:
+        summary: The result of `summarise`.
+        title: Heading above the tables.
+        notes: Lines below the tables.
+        metrics: The metrics, in the order of the columns. Those whose field `column` is False are left out.
+    """
+    shown = [metric for metric in metrics if metric.column]
+    lines = _head(["predictor", *(metric.title for metric in shown)])
+    for name, cells in summary["predictors"].items():
+        lines.append(_row([name, *(_shown(cells, metric, interval=metric.interval) for metric in shown)]))
+    compared = [metric for metric in shown if metric.compared is not None]
+    lines += ["", _directions(compared), "", *_head(["predictor", "baseline", *(metric.title for metric in compared)])]
+    for name, against in summary["differences"].items():
+        for base, differences in against.items():
+            texts = [_shown(differences, metric, interval=True) for metric in compared]
+            if set(texts) != {"-"}:
+                lines.append(_row([name, base, *texts]))
+    return _page(summary, title, shown, lines, notes)
+
+
+def _head(cells: Sequence[str]) -> list[str]:
+    return [_row(cells), "|---" * len(cells) + "|"]
+
+
+def _row(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def _shown(cells: Mapping[str, dict | None], metric: Metric, *, interval: bool) -> str:
+    """The text of a cell: the value of a metric, or "-" if the predictor does not have the metric."""
+    if metric.name not in cells:
+        raise ValueError(f"summary lacks {metric.name!r}: pass all metrics of the table to score() and summarise()")
+    cell = cells[metric.name]
+    if cell is None:
+        return "-"
+    value, low, high = (f"{cell[key] * metric.factor:.{metric.digits}f}" for key in ("value", "low", "high"))
+    return f"{value} [{low}, {high}]" if interval else value
+
+
+def _directions(compared: Sequence[Metric]) -> str:
+    """Sentences above the differences: for which metrics a positive or a negative difference is better."""
+    text = "Differences from the baselines (predictor minus baseline)."
+    for sign, direction in (("positive", "higher"), ("negative", "lower")):
+        headings = [
+            metric.heading or metric.name.replace("_", " ") for metric in compared if metric.compared == direction
+        ]
+        if headings:
+            text += f" A {sign} difference is better for {', '.join(headings)}."
+    return text
+
+
+def _page(summary: dict, title: str, metrics: Sequence[Metric], lines: Sequence[str], notes: Sequence[str]) -> str:
+    """Tables with their title, the number of held-out trajectories, explanations of the metrics, and notes."""
+    outcomes = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in summary["outcomes"].items())
+    text = (
+        f"{summary['items']} held-out trajectories of {summary['objects']} objects ({outcomes}). Brackets contain "
+        "95 % bootstrap intervals over objects."
+    )
+    fewer = [
+        f'The metrics of "{name}" are over the first {count} trajectories.'
+        for name, count in summary["scored"].items()
+        if count < summary["items"]
+    ]
+    explained = dict.fromkeys(metric.note for metric in metrics if metric.note)
+    return "\n".join([f"# {title}", "", " ".join([text, *fewer, *explained]), "", *lines, "", *notes, ""])
