@@ -68,7 +68,7 @@ def test_predictions_are_those_of_single_items_in_calls_of_equal_size(count):
 def test_no_trajectories_are_refused():
     test, model = pairs(np.arange(3), np.arange(3)), Echo()
     test = test.take(slice(0))
-    with pytest.raises(ValueError, match="`test` has 0 trajectories, but at least one is needed"):
+    with pytest.raises(ValueError, match="`test` has 0 trajectories: choose"):
         evaluation.predict(model, ("visual",), test, physics.Freefall())
     assert not model.calls
 

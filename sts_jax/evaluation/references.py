@@ -125,9 +125,12 @@ def _distance(train: Streams, test: Streams) -> np.ndarray:
 
 def _images(train: Streams, test: Streams, nearest: np.ndarray) -> dict[str, Predicted]:
     """The images of three baselines: the constant, the copy, and those of the nearest neighbours."""
-    means = (images[:, 1].mean(0) / 255 for images in (train.visual, train.tactile))
+
+    def mean(stream: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(stream[:, 1].mean(0) / 255, (len(test.visual), *stream.shape[2:]))
+
     return {
-        CONSTANT: Predicted(*(np.broadcast_to(mean, (len(test.visual), *mean.shape)) for mean in means)),
+        CONSTANT: Predicted(mean(train.visual), mean(train.tactile)),
         COPY: Predicted(test.visual[:, 0] / 255, test.tactile[:, 0] / 255),
         NEIGHBOUR: Predicted(train.visual[nearest, 1] / 255, train.tactile[nearest, 1] / 255),
     }

@@ -187,10 +187,13 @@ def _statistic(metric: Metric, scores: Scores, constant: Scores, test: Pairs) ->
     values = values[items]
 
     def statistic(weight: np.ndarray) -> float:
-        value = metric.reduce(values, weight[items])
+        w = weight[items]
+        if not w.any():
+            return np.nan
+        value = float(metric.reduce(values, w))
         if reference is None:
             return value
-        whole = metric.reduce(reference, weight[items])
+        whole = float(metric.reduce(reference, w))
         return 1 - value / whole if whole > 0 else np.nan
 
     return statistic

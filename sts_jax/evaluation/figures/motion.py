@@ -28,8 +28,8 @@ _HOLD = 1500  # ms, duration of the last frame
 _REACH = 0.035  # s^2/m, length of the gravity arrow per unit of gravity, as a share of the image's side
 _VISIBLE = 0.1  # m/s^2, smallest component of gravity along the pad that has an arrow
 _THICKNESS = 0.012  # m, thickness of the box that is drawn as the housing of the sensor
-_PAD = np.float32([178, 178, 204]) / 255  # sRGB
-_HOUSING = np.float32([0.05, 0.05, 0.055])
+_PAD = np.array([178, 178, 204], np.float32) / 255  # sRGB
+_HOUSING = np.array([0.05, 0.05, 0.055], np.float32)
 
 
 @functools.partial(jax.jit, static_argnames=("resolution",))
