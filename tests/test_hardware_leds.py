@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from unittest import mock
 
 import pytest
 import serial
@@ -22,6 +23,7 @@ from serial.tools import list_ports_common
 from benchmarks.instruments.led_peer import Peer
 from sts_jax import hardware
 from sts_jax.hardware import emulation, protocol
+from sts_jax.hardware.leds import checked_levels
 
 ON = (255, 0, 128, 1)
 PAGE = Path(__file__).parents[1] / "docs" / "hardware" / "protocol.md"
@@ -81,16 +83,11 @@ def test_checksum_equals_the_published_value_and_a_bitwise_computation():
         assert protocol.checksum(text) == bitwise_checksum(text) == binascii.crc_hqx(text, 0xFFFF)
 
 
-@pytest.mark.parametrize("request_", REQUESTS, ids=str)
-def test_requests_survive_the_line(request_):
-    assert protocol.decode_request(protocol.encode_request(request_)) == request_
-
-
-@pytest.mark.parametrize("reply", REPLIES, ids=str)
-def test_replies_survive_the_line(reply):
-    line = protocol.encode_reply(reply)
-    assert len(line) <= protocol.LONGEST_LINE
-    assert protocol.decode_reply(line) == reply
+def test_messages_survive_the_line():
+    for request in REQUESTS:
+        assert protocol.decode_request(protocol.encode_request(request)) == request
+    for reply in REPLIES:
+        assert protocol.decode_reply(protocol.encode_reply(reply)) == reply
 
 
 LINES = [protocol.encode_request(x) for x in REQUESTS] + [protocol.encode_reply(x) for x in REPLIES]
@@ -119,62 +116,45 @@ def test_cut_joined_swapped_and_extended_lines_are_rejected(line):
 
 
 @pytest.mark.parametrize(
-    ("text", "code", "sequence"),
+    ("code", "sequence", "texts"),
     [
-        ("0 PING", protocol.Code.ARGUMENTS, 0),
-        ("65536 PING", protocol.Code.ARGUMENTS, 0),
-        ("01 PING", protocol.Code.ARGUMENTS, 0),
-        (" 1 PING", protocol.Code.ARGUMENTS, 0),
-        ("PING", protocol.Code.ARGUMENTS, 0),
-        ("1", protocol.Code.COMMAND, 1),
-        ("2 ping", protocol.Code.COMMAND, 2),
-        ("2  PING", protocol.Code.COMMAND, 2),
-        ("3 PING ", protocol.Code.ARGUMENTS, 3),
-        ("3 PING 1", protocol.Code.ARGUMENTS, 3),
-        ("4 SET 1 2 3", protocol.Code.ARGUMENTS, 4),
-        ("4 SET 1 2 3 4 5", protocol.Code.ARGUMENTS, 4),
-        ("4 SET 1 2 3 4 ", protocol.Code.ARGUMENTS, 4),
-        ("4 SET 1 2 3 256", protocol.Code.ARGUMENTS, 4),
-        ("4 SET 1 2 3 -1", protocol.Code.ARGUMENTS, 4),
-        ("4 SET 1 2 3 +1", protocol.Code.ARGUMENTS, 4),
-        ("4 SET 1 2 3 04", protocol.Code.ARGUMENTS, 4),
-        ("4 SET 1 2 3 4294967297", protocol.Code.ARGUMENTS, 4),
-        ("5 WATCH 99", protocol.Code.ARGUMENTS, 5),
-        ("5 WATCH 10001", protocol.Code.ARGUMENTS, 5),
-        ("5 WATCH", protocol.Code.ARGUMENTS, 5),
-        ("6 HELLO", protocol.Code.ARGUMENTS, 6),
-        ("6 HELLO x", protocol.Code.ARGUMENTS, 6),
+        (protocol.Code.ARGUMENTS, 0, ["0 PING", "65536 PING", "01 PING", " 1 PING", "PING"]),
+        (protocol.Code.COMMAND, 2, ["2", "2 ping", "2  PING"]),
+        (protocol.Code.ARGUMENTS, 3, ["3 PING ", "3 PING 1", "3 WATCH 99", "3 WATCH 10001", "3 WATCH"]),
+        (protocol.Code.ARGUMENTS, 4, [f"4 SET 1 2 3{end}" for end in ("", " 4 5", " 4 ", " 256", " -1", " +1", " 04")]),
+        (protocol.Code.ARGUMENTS, 6, ["6 SET 1 2 3 4294967297", "6 HELLO", "6 HELLO x"]),
     ],
 )
-def test_bad_requests_name_the_line_and_the_error_code(text, code, sequence):
-    line = protocol.encode(text)
-    with pytest.raises(protocol.ProtocolError, match=re.escape(repr(line))) as caught:
-        protocol.decode_request(line)
-    assert (caught.value.code, caught.value.sequence) == (code, sequence)
+def test_bad_requests_name_the_line_and_the_error_code(code, sequence, texts):
+    for text in texts:
+        line = protocol.encode(text)
+        with pytest.raises(protocol.ProtocolError, match=re.escape(repr(line))) as caught:
+            protocol.decode_request(line)
+        assert (caught.value.code, caught.value.sequence) == (code, sequence)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "1 OK",
-        "1 OK SET 1 2 3 4 5",
-        "1 OK SET 1 2 3 4 5 65536",
-        "1 OK SET 1 2 3 256 5 6",
-        "1 OK PING 1 2 3 4 5 6",
-        "1 OK PING 1 2 3 4 4294967296 6 7",
-        "1 OK WATCH 5",
-        "1 OK HELLO 1 1.0 uno",
-        "1 OK HELLO 1 1.0 uno X 3",
-        "1 OK HELLO 1 1.0 uno X/Y 4",
-        "0 OK SET 1 2 3 4 5 6",
-        "1 ERR 9 text",
-        "1 ERR 0 text",
-        "1 ERR 1",
-        "1 OFF watchdog 5",
-        "0 OFF watchdog 0",
-        "hello",
-    ],
-)
+BAD_REPLIES = """\
+1 OK
+1 OK SET 1 2 3 4 5
+1 OK SET 1 2 3 4 5 65536
+1 OK SET 1 2 3 256 5 6
+1 OK PING 1 2 3 4 5 6
+1 OK PING 1 2 3 4 4294967296 6 7
+1 OK WATCH 5
+1 OK HELLO 1 1.0 uno
+1 OK HELLO 1 1.0 uno X 3
+1 OK HELLO 1 1.0 uno X/Y 4
+0 OK SET 1 2 3 4 5 6
+1 ERR 9 text
+1 ERR 0 text
+1 ERR 1
+1 OFF watchdog 5
+0 OFF watchdog 0
+hello
+"""
+
+
+@pytest.mark.parametrize("text", BAD_REPLIES.splitlines())
 def test_bad_replies_are_rejected(text):
     with pytest.raises(protocol.ProtocolError, match="not a reply"):
         protocol.decode_reply(protocol.encode(text))
@@ -185,7 +165,7 @@ def test_messages_that_do_not_fit_a_line_are_not_sent():
         protocol.encode("x" * 60)
     with pytest.raises(protocol.ProtocolError, match="printable ASCII"):
         protocol.encode("1 PING*")
-    with pytest.raises(protocol.ProtocolError, match="wrong number of arguments"):
+    with pytest.raises(protocol.ProtocolError, match="wrong number or range of arguments"):
         protocol.encode_request(protocol.Set(1, (0, 0, 0, 300)))
 
 
@@ -277,16 +257,6 @@ def test_each_request_is_executed_once_whatever_happens_to_its_answer(peer, firs
             assert leds.ping().unchanged_since(lit)
 
 
-def test_repetitions_have_the_same_sequence_number(peer):
-    with connect(peer.path) as leds:
-        peer.requests.clear()
-        peer.faults = ["lost", "garbled", "deaf"]
-        leds.set(ON)
-        sent = [line for line in peer.requests if b"SET" in line]
-        assert len(sent) == 4
-        assert len(set(sent)) == 1
-
-
 def test_a_silent_controller_gives_a_timeout_and_works_again_later(peer):
     with connect(peer.path, answer_s=0.3) as leds:
         peer.faults = ["deaf"] * 100
@@ -309,30 +279,22 @@ def test_a_write_that_pyserial_calls_late_is_no_error_if_the_answer_arrives(peer
         assert leds.set(ON).levels == ON
 
 
-def test_a_port_that_accepts_no_bytes_is_named(peer, monkeypatch):
-    def full(self, data):
-        raise serial.SerialTimeoutException("Write timeout")
-
-    with connect(peer.path, answer_s=0.3) as leds:
-        with monkeypatch.context() as patch:
-            patch.setattr(serial.Serial, "write", full)
-            with pytest.raises(hardware.LedTimeoutError, match=r"port .* accepted no bytes for 0\.3 s\. Unplug"):
-                leds.set(ON)
-        leds._answer_s = 20.0
-        assert leds.set(ON).levels == ON
+@pytest.mark.parametrize("levels", [(1, 2, 3), (0, 0, 0, 256), (0, 0, 0, -1), (0, 0, 0, 1, 2), (0, 0, 0, 0.5)])
+def test_bad_levels_are_named(levels):
+    with pytest.raises(ValueError, match="levels must be 4 integers"):
+        checked_levels(levels)
 
 
-@pytest.mark.parametrize("levels", [(1, 2, 3), (0, 0, 0, 256), (0, 0, 0, -1), (0, 0, 0, 1, 2)])
-def test_bad_levels_are_named(peer, levels):
-    with connect(peer.path) as leds, pytest.raises(ValueError, match="levels must be 4 integers"):
-        leds.set(levels)
-
-
-def test_bad_times_are_named(tmp_path):
-    with pytest.raises(ValueError, match=r"watchdog_ms must be in 100\.\.10000, got 50"):
-        connect(tmp_path / "port", watchdog_ms=50)
-    with pytest.raises(ValueError, match="answer_s must be positive and finite, got 0"):
-        connect(tmp_path / "port", answer_s=0.0)
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"watchdog_ms": 50}, r"watchdog_ms must be in 100\.\.10000, got 50"),
+        ({"answer_s": 0.0}, "answer_s must be positive and finite, got 0"),
+    ],
+)
+def test_bad_times_are_named(options, message):
+    with pytest.raises(ValueError, match=message):
+        connect("/dev/null", **options)
 
 
 def test_lights_stay_on_while_the_host_lives(peer):
@@ -417,25 +379,24 @@ def test_ports_are_listed_with_their_usb_serial_numbers(monkeypatch):
     first, second = hardware.find_controllers()
     assert (first.device, first.serial_number, first.vendor) == ("/dev/ttyACM0", "55", 0x2341)
     assert (second.device, second.serial_number) == ("/dev/ttyS0", None)
-    with pytest.raises(hardware.PortNotFoundError, match=r"no port /dev/missing.*ttyACM0 \(Arduino Uno\), /dev/ttyS0"):
-        connect("/dev/missing")
-    with pytest.raises(hardware.PortNotFoundError, match="URL of pyserial"):
-        connect("nonsense://port")
 
 
-def test_no_permission_names_the_group(monkeypatch, tmp_path):
-    def forbidden(*_, **__):
-        raise serial.SerialException(13, "could not open port: Permission denied")
-
-    monkeypatch.setattr(serial, "serial_for_url", forbidden)
-    with pytest.raises(hardware.PortPermissionError, match=r"usermod -aG .*dialout"):
-        connect(tmp_path / "port")
-
-
-def test_a_file_is_no_serial_port(tmp_path):
-    (tmp_path / "file").write_text("text")
-    with pytest.raises(hardware.NotALedControllerError, match="not a serial port"):
-        connect(tmp_path / "file")
+@pytest.mark.parametrize(
+    ("port", "error", "message"),
+    [
+        ("/dev/missing", None, r"cannot open /dev/missing: .*No such file.* Ports found: /dev/ttyACM0 \(Arduino Uno\)"),
+        ("nonsense://port", None, "cannot open nonsense://port: "),
+        (str(PAGE), None, "Inappropriate ioctl for device"),
+        ("/dev/ttyACM0", serial.SerialException(13, "Permission denied"), "usermod -aG dialout"),
+        ("/dev/ttyACM0", serial.SerialException(11, "Resource unavailable"), "it is in use: close the other program"),
+    ],
+)
+def test_a_port_that_cannot_be_opened_is_named(monkeypatch, port, error, message):
+    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: [usb_port("/dev/ttyACM0", "55")])
+    if error is not None:
+        monkeypatch.setattr(serial, "serial_for_url", mock.Mock(side_effect=error))
+    with pytest.raises(hardware.LedError, match=message):
+        connect(port)
 
 
 @pytest.mark.parametrize(
@@ -443,21 +404,21 @@ def test_a_file_is_no_serial_port(tmp_path):
     [
         (b"", "Nothing was received"),
         (b"$GPGGA,092750.000,5321.6802,N*76\r\n", r"Received b'\$GPGGA.*another device"),
-        (b"\x80\xf8\x00\xfe\x87\x00\xf0" * 30, "not text.*typical of a wrong baud rate.*opened at 9600 baud.*115200"),
+        (b"\x80\xf8\x00\xfe\x87\x00\xf0" * 30, "not text.*baud rate may be wrong .opened at 9600 baud.*115200"),
         (protocol.encode("1 OK SET 0 0 0 0 0 0"), "no LED controller answered"),
         (protocol.encode("0 ERR 1 checksum"), "no LED controller answered"),
-        (b"\x00" * 4000, "typical of a wrong baud rate"),
+        (b"\x00" * 4000, "baud rate may be wrong"),
     ],
     ids=["silence", "text", "garbage", "answers to nobody", "refusals of nothing", "flood"],
 )
 def test_another_device_is_described(tmp_path, talk, message):
     other = Peer(tmp_path / "port", talk=talk)
-    with pytest.raises(hardware.NotALedControllerError, match=message):
+    with pytest.raises(hardware.LedError, match=message):
         connect(other.path, timeout_s=0.4, baud=9600)
     other.vanish()
 
 
-def test_another_version_of_the_protocol_is_named(tmp_path, monkeypatch):
+def test_another_version_of_the_protocol_is_named(tmp_path):
     class Newer(emulation.EmulatedController):
         def _execute(self, request, now_s):
             if isinstance(request, protocol.Hello):
@@ -466,19 +427,9 @@ def test_another_version_of_the_protocol_is_named(tmp_path, monkeypatch):
 
     newer = Peer(tmp_path / "port")
     newer.controller = Newer()
-    with pytest.raises(hardware.WrongVersionError, match=r"\(version 2\).* needs version 1\. Flash.*make flash PORT"):
-        connect(newer.path)
-    newer.controller = emulation.EmulatedController()
-    monkeypatch.setattr(protocol, "VERSION", 3)
-    monkeypatch.setattr(protocol.Hello.__init__, "__defaults__", (3,))
-    monkeypatch.setattr(newer.controller, "_execute", refuse_version)
-    with pytest.raises(hardware.WrongVersionError, match=r"\(protocol 1\).* needs version 3"):
+    with pytest.raises(hardware.LedError, match=r"\(version 2\) than 1\. Flash.*make flash PORT"):
         connect(newer.path)
     newer.vanish()
-
-
-def refuse_version(request, now_s):
-    return protocol.Refused(request.sequence, protocol.Code.VERSION, "protocol 1")
 
 
 HOLD = "import serial, sys; s = serial.Serial(sys.argv[1], exclusive=True); print('open', flush=True); sys.stdin.read()"
@@ -488,20 +439,14 @@ def test_two_processes_cannot_share_a_port(peer):
     arguments = [sys.executable, "-c", HOLD, str(peer.path)]
     holder = subprocess.Popen(arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     assert holder.stdout.readline() == b"open\n"
-    with pytest.raises(hardware.PortInUseError, match=rf"in use by process {holder.pid} \(.*close the other program"):
+    with pytest.raises(hardware.LedError, match="in use: close the other program"):
         connect(peer.path)
     holder.communicate()
     with connect(peer.path):
         refused = subprocess.run(arguments, capture_output=True, input=b"", check=False)
         assert b"exclusively lock" in refused.stderr
-        with pytest.raises(hardware.PortInUseError, match="another part of this process"):
+        with pytest.raises(hardware.LedError, match="it is in use"):
             connect(peer.path)
-
-
-def test_hardware_imports_no_jax():
-    folder = Path(hardware.__file__).parent
-    for path in (folder / name for name in ("protocol.py", "emulation.py", "leds.py")):
-        assert not re.search(r"^\s*(import|from) (jax|sts_jax(?!\.hardware))", path.read_text(), re.MULTILINE), path
 
 
 # ---- Firmware

@@ -175,7 +175,7 @@ def test_lights_that_never_stay_on_are_an_error(logged, monkeypatch):
 def test_bad_sensors_are_refused():
     with twin.Twin(picture()) as made, pytest.raises(ValueError, match=r"at least one above 0, got \(0, 0, 0, 0\)"):
         twin.VirtualSensor(made, levels=(0, 0, 0, 0))
-    with twin.Twin(picture(tactile=0.4)) as made, pytest.raises(hardware.NoContrastError, match="wiring"):
+    with twin.Twin(picture(tactile=0.4)) as made, pytest.raises(hardware.LightError, match="wiring"):
         twin.VirtualSensor(made)
     with twin.Twin(picture()) as made:
         made.run_on(lambda: 0.0)

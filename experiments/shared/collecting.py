@@ -101,11 +101,12 @@ def collect(config: Collect) -> None:
                     say("stopped")
                 session.flush()
                 say(f"{session.confirmed} confirmed trajectories in {session.folder}")
-            counts = sensor.camera.statistics
-            say(
-                f"{counts.frames} frames arrived. {counts.skipped} of them were not read in time, and the camera lost "
-                f"{counts.dropped} others"
-            )
+            if isinstance(sensor.camera, hardware.OpenCVCamera):
+                counts = sensor.camera.statistics
+                say(
+                    f"{counts.frames} frames arrived. {counts.skipped} of them were not read in time, and the camera "
+                    f"lost {counts.dropped} others"
+                )
 
 
 def of_twin(config: Collect) -> Simulated:

@@ -25,7 +25,6 @@ CORRECTABLE = (
     LockedError,
     hardware.CameraError,
     hardware.LightError,
-    hardware.NoContrastError,
 )
 KEYS = {"\n": Action.CONFIRM, "\r": Action.CONFIRM, "d": Action.DISCARD, "q": Action.STOP}
 _EVERY_S = 10.0  # time between two lines of progress where standard error is not a terminal (s)

@@ -15,41 +15,21 @@ from sts_jax.hardware.calibration import (
     view_angle,
 )
 from sts_jax.hardware.camera import (
-    CameraBusyError,
+    Camera,
     CameraConfig,
     CameraError,
     CameraLostError,
-    CameraNotConnectedError,
-    CameraNotFoundError,
-    CameraOpenError,
-    CameraPermissionError,
-    CameraStatistics,
     CameraTimeoutError,
     Captured,
-    EndOfVideoError,
     FoundCamera,
     FrameSizeError,
     FrozenCameraError,
     StaleFrameError,
     find_cameras,
-    is_black,
 )
 from sts_jax.hardware.collecting import Action, AutomaticPerson, PairReader, Person, View, collect
 from sts_jax.hardware.guide import EmptyPad, GuideConfig, Stage, known_pad
-from sts_jax.hardware.leds import (
-    DisconnectedError,
-    LedError,
-    Leds,
-    LedTimeoutError,
-    Lit,
-    NotALedControllerError,
-    Port,
-    PortInUseError,
-    PortNotFoundError,
-    PortPermissionError,
-    WrongVersionError,
-    find_controllers,
-)
+from sts_jax.hardware.leds import DisconnectedError, LedError, Leds, LedTimeoutError, Lit, Port, find_controllers
 from sts_jax.hardware.lens import (
     Lens,
     SensorView,
@@ -61,8 +41,8 @@ from sts_jax.hardware.lens import (
     relit,
     sensor_view,
 )
-from sts_jax.hardware.opencv import OpenCVCamera
-from sts_jax.hardware.proof import LightError, NoContrastError, NotStillError, Pair, Settling, Shot
+from sts_jax.hardware.opencv import CameraStatistics, OpenCVCamera
+from sts_jax.hardware.proof import LightError, Pair, Settling, Shot
 from sts_jax.hardware.recording import Recorder, Replay
 from sts_jax.hardware.sensor_file import Device, SensorFileError, WrongDeviceError, copy_sensor
 from sts_jax.hardware.session import (
@@ -90,21 +70,16 @@ __all__ = [
     "Board",
     "Calibration",
     "CalibrationError",
-    "CameraBusyError",
+    "Camera",
     "CameraConfig",
     "CameraError",
     "CameraLostError",
-    "CameraNotConnectedError",
-    "CameraNotFoundError",
-    "CameraOpenError",
-    "CameraPermissionError",
     "CameraStatistics",
     "CameraTimeoutError",
     "Captured",
     "Device",
     "DisconnectedError",
     "EmptyPad",
-    "EndOfVideoError",
     "Entry",
     "Exposed",
     "FoundCamera",
@@ -119,18 +94,12 @@ __all__ = [
     "Lens",
     "LightError",
     "Lit",
-    "NoContrastError",
-    "NotALedControllerError",
-    "NotStillError",
     "OpenCVCamera",
     "Origin",
     "Pair",
     "PairReader",
     "Person",
     "Port",
-    "PortInUseError",
-    "PortNotFoundError",
-    "PortPermissionError",
     "RecordedImages",
     "RecordedTrajectory",
     "Recorder",
@@ -146,7 +115,6 @@ __all__ = [
     "StaleFrameError",
     "View",
     "WrongDeviceError",
-    "WrongVersionError",
     "board_image",
     "brightness",
     "calibrate",
@@ -164,7 +132,6 @@ __all__ = [
     "find_controllers",
     "find_sensors",
     "fit_lens",
-    "is_black",
     "known_pad",
     "list_recordings",
     "load_recordings",

@@ -1,10 +1,4 @@
-"""A software emulation of the LED controller, which answers the requests of the serial protocol.
-
-The emulation has no clock. The caller therefore passes the current time in each call.
-
-The tests run the real controller's firmware in a simulator of its microcontroller, and compare the answers of the
-firmware with the answers of the emulation.
-"""
+"""A software emulation of the LED controller, for places without hardware. Tests compare it with the real firmware."""
 
 from sts_jax.hardware import protocol
 
@@ -18,10 +12,7 @@ _TEXTS = {
 
 
 class EmulatedController:
-    """An emulated LED controller, which replaces the real one where there is no hardware.
-
-    `receive` takes the request bytes and the time, so no serial port is needed. Not thread-safe.
-    """
+    """An emulated LED controller without a clock: each call passes the current time. Not thread-safe."""
 
     def __init__(self, *, now_s: float = 0.0, boot: int = 1, serial_number: str = "EMULATED"):
         """Boot the controller with all lights off.
@@ -41,29 +32,14 @@ class EmulatedController:
         self._answered: tuple[bytes, bytes] | None = None  # the last request that was executed, and its answer
 
     def receive(self, data: bytes, now_s: float) -> bytes:
-        """Process bytes from the host and return the controller's answers.
-
-        Args:
-            data: Any number of bytes. An incomplete line is kept until the rest of the line arrives.
-            now_s: Current time, on the same clock as `now_s` of the constructor (s).
-
-        Returns:
-            The lines that the controller sends, or empty bytes if it sends none.
-        """
+        """Process any number of bytes from the host, and return the lines that the controller sends."""
         sent = self.tick(now_s)
         *lines, self._pending = (self._pending + data).split(b"\n")
         self._pending = self._pending[: protocol.LONGEST_LINE]  # enough to see that the line is too long
         return sent + b"".join(self._answer(line + b"\n", now_s) for line in lines if line)
 
     def tick(self, now_s: float) -> bytes:
-        """Turn the lights off if no valid request has arrived for the watchdog's period (attribute `watch_ms`).
-
-        Args:
-            now_s: Current time, on the same clock as `now_s` of the constructor (s).
-
-        Returns:
-            The line with which the controller reports the change, or empty bytes if the lights did not change.
-        """
+        """Turn the lights off if the watchdog's period has passed, and return the line that reports it."""
         if self.levels == protocol.DARK or now_s - self._valid_s < self.watch_ms / 1000:
             return b""
         self._apply(protocol.DARK)
@@ -86,11 +62,7 @@ class EmulatedController:
         match request:
             case protocol.Hello(sequence, version):
                 if version != protocol.VERSION:
-                    raise protocol.ProtocolError(
-                        f"the version of the protocol must be {protocol.VERSION}, got {version}",
-                        protocol.Code.VERSION,
-                        sequence,
-                    )
+                    raise protocol.ProtocolError(f"unknown version {version}", protocol.Code.VERSION, sequence)
                 names = "emulated", "emulation", self._serial_number
                 return protocol.Controller(sequence, protocol.VERSION, *names, channels=protocol.CHANNELS)
             case protocol.Set(sequence, levels):

@@ -1,10 +1,8 @@
 """The serial protocol of the LED controller: messages as dataclasses, and their encoding as lines of text.
 
-A line consists of ASCII text, `*`, the checksum of the text in four hexadecimal digits, and a newline. For example,
-`7 PING*018E` is a request with the sequence number 7. The host sends requests, and the controller answers each request
-with one reply of the same sequence number. The page docs/hardware/protocol.md defines the requests and the replies.
-
-Parsing is strict: each message has exactly one valid line. Any other line raises a `ProtocolError`.
+A line consists of ASCII text, `*`, the checksum of the text in four hexadecimal digits, and a newline, such as
+`7 PING*018E`. The host sends requests, and the controller answers each with one reply of the same sequence number.
+docs/hardware/protocol.md defines them. Each message has exactly one valid line. Any other line is a `ProtocolError`.
 """
 
 import binascii
@@ -20,13 +18,14 @@ LAST_SEQUENCE = 65535  # largest sequence number. 1 follows it. 0 marks replies 
 SHORTEST_WATCH_MS = 100  # shortest period of the watchdog (ms)
 LONGEST_WATCH_MS = 10_000  # longest period of the watchdog (ms)
 DEFAULT_WATCH_MS = 1000  # period of the watchdog after a boot (ms)
+_UINT16, _UINT32 = 2**16 - 1, 2**32 - 1
 
 Levels = tuple[int, int, int, int]  # duty cycles of the channels, 0 (off) to 255 (always on)
 DARK: Levels = (0, 0, 0, 0)
 
 
 class Code(enum.IntEnum):
-    """The reason why the LED controller refused a request, such as a wrong checksum or an unknown command."""
+    """The reason why the LED controller refused a request."""
 
     CHECKSUM = 1  # the checksum of the line is wrong
     COMMAND = 2  # there is no such command
@@ -36,12 +35,7 @@ class Code(enum.IntEnum):
 
 
 class ProtocolError(ValueError):
-    """Raised for a line that is not a valid message of the LED controller's protocol. The error's text shows the line.
-
-    Attributes:
-        code: Error code that a controller sends in its reply to this line.
-        sequence: Sequence number of that reply.
-    """
+    """A line is not a valid message. `code` and `sequence` are those of the controller's reply to this line."""
 
     def __init__(self, message: str, code: Code = Code.CHECKSUM, sequence: int = 0):
         super().__init__(message)
@@ -51,7 +45,7 @@ class ProtocolError(ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class Hello:
-    """Request for the description of the controller. The reply is a `Controller` message."""
+    """Request for the description of the controller (`Controller`)."""
 
     sequence: int
     version: int = VERSION  # version of the protocol that the host uses
@@ -59,28 +53,22 @@ class Hello:
 
 @dataclasses.dataclass(frozen=True)
 class Set:
-    """Request to set the levels of the lights. The reply is a `State` message."""
+    """Request to set the levels of the lights (`State`)."""
 
     sequence: int
-    levels: Levels  # duty cycles of the channels, 0 (off) to 255 (always on)
+    levels: Levels
 
 
 @dataclasses.dataclass(frozen=True)
 class Ping:
-    """Request for the state of the lights. The reply is a `State` message.
-
-    Like any request, it restarts the watchdog, which turns the lights off after a time without requests.
-    """
+    """Request for the state of the lights (`State`). Like any request, it restarts the watchdog."""
 
     sequence: int
 
 
 @dataclasses.dataclass(frozen=True)
 class Watch:
-    """Request to set the watchdog's period. The reply is a `Watching` message.
-
-    The watchdog turns the lights off if the controller receives no request during this period.
-    """
+    """Request to set the watchdog's period (`Watching`)."""
 
     sequence: int
     period_ms: int  # the lights go off after this time without a request, 100 to 10000 (ms)
@@ -88,7 +76,7 @@ class Watch:
 
 @dataclasses.dataclass(frozen=True)
 class Controller:
-    """The reply to a `Hello` request. It describes the controller."""
+    """The reply to a `Hello` request."""
 
     sequence: int
     version: int  # version of the protocol that the controller uses
@@ -100,7 +88,7 @@ class Controller:
 
 @dataclasses.dataclass(frozen=True)
 class State:
-    """The reply to a `Set` or `Ping` request. It describes the state of the lights."""
+    """The reply to a `Set` or `Ping` request."""
 
     sequence: int
     levels: Levels  # duty cycles that are applied at the time of the reply
@@ -111,18 +99,18 @@ class State:
 
 @dataclasses.dataclass(frozen=True)
 class Watching:
-    """The reply to a `Watch` request: the controller will turn the lights off after `period_ms` without requests."""
+    """The reply to a `Watch` request."""
 
     sequence: int
-    period_ms: int  # the lights go off after this time without a request (ms)
+    period_ms: int
 
 
 @dataclasses.dataclass(frozen=True)
 class Refused:
-    """The reply to a request that the controller did not execute. It gives the reason."""
+    """The reply to a request that the controller did not execute."""
 
     sequence: int  # 0 if the controller could not read the request's sequence number
-    code: Code  # reason for the refusal
+    code: Code
     text: str  # the reason in words
 
 
@@ -138,65 +126,35 @@ Reply = Controller | State | Watching | Refused | TurnedOff
 
 
 def checksum(text: bytes) -> int:
-    """Return the CRC-16/CCITT-FALSE of a text: polynomial 0x1021, initial value 0xFFFF, not reflected, not inverted."""
+    """CRC-16/CCITT-FALSE of a text: polynomial 0x1021, initial value 0xFFFF, not reflected, not inverted."""
     return binascii.crc_hqx(text, 0xFFFF)
 
 
 def encode(text: str) -> bytes:
-    """Append the checksum and the newline to a text.
-
-    Args:
-        text: Printable ASCII without `*`.
-
-    Returns:
-        The line, at most 64 bytes (`LONGEST_LINE`).
-
-    Raises:
-        ProtocolError: The text is empty, contains `*` or a character that is not printable ASCII, or is too long.
-    """
+    """Append the checksum and the newline to a text of printable ASCII without `*`."""
     if not re.fullmatch(r"[ -)+-~]+", text):
         raise ProtocolError(f"a message must consist of printable ASCII without '*', got {text!r}", Code.ARGUMENTS)
     line = f"{text}*{checksum(text.encode()):04X}\n".encode()
     if len(line) > LONGEST_LINE:
-        raise ProtocolError(
-            f"a line must have at most {LONGEST_LINE} bytes, got {len(line)}: {text!r}. Shorten the text.", Code.LENGTH
-        )
+        raise ProtocolError(f"a line must have at most {LONGEST_LINE} bytes, got {len(line)}: {text!r}", Code.LENGTH)
     return line
 
 
 def decode(line: bytes) -> str:
-    """Check the checksum of a line, and return the text before the checksum.
-
-    Args:
-        line: The whole line, with its newline.
-
-    Raises:
-        ProtocolError: The line is longer than 64 bytes (`LONGEST_LINE`), contains other bytes than printable ASCII,
-            lacks the checksum or the newline, or has a wrong checksum.
-    """
+    """Check the checksum of a line with its newline, and return the text before the checksum."""
     if len(line) > LONGEST_LINE:
-        raise ProtocolError(
-            f"a line must have at most {LONGEST_LINE} bytes, got {len(line)}: {line!r}. The sender must shorten it.",
-            Code.LENGTH,
-        )
-    found = re.fullmatch(rb"([ -)+-~]+)\*([0-9A-F]{4})\n", line)
-    if found is None:
+        raise ProtocolError(f"a line must have at most {LONGEST_LINE} bytes, got {len(line)}: {line!r}", Code.LENGTH)
+    match = re.fullmatch(rb"([ -)+-~]+)\*([0-9A-F]{4})\n", line)
+    if match is None:
         raise ProtocolError(f"a line must consist of a text, '*', four hexadecimal digits and a newline, got {line!r}")
-    text, digits = found.groups()
+    text, digits = match.groups()
     if int(digits, 16) != checksum(text):
-        raise ProtocolError(
-            f"the checksum of the text is {checksum(text):04X}, but the line has {digits.decode()}: {line!r}. Send the "
-            "line again, because it was probably damaged on its way."
-        )
+        raise ProtocolError(f"the line {line!r} is damaged: the checksum of its text is {checksum(text):04X}")
     return text.decode()
 
 
 def encode_request(request: Request) -> bytes:
-    """Encode a request as a line with its checksum and newline.
-
-    Raises:
-        ProtocolError: A value of the request is out of range.
-    """
+    """Encode a request as a line with its checksum and newline."""
     match request:
         case Hello(sequence, version):
             text = f"{sequence} HELLO {version}"
@@ -212,24 +170,13 @@ def encode_request(request: Request) -> bytes:
 
 
 def decode_request(line: bytes) -> Request:
-    """Decode a request from a line.
-
-    Args:
-        line: The whole line, with its checksum and newline.
-
-    Raises:
-        ProtocolError: The line is not a valid request. A controller answers such a line with a `Refused` reply. The
-            attributes `code` and `sequence` of the error are those of this reply.
-    """
-    text = decode(line)
-    words = text.split(" ")
+    """Decode a request from a line with its checksum and newline."""
+    words = decode(line).split(" ")
     sequence = _number(words[0], 1, LAST_SEQUENCE)
     if sequence is None:
-        raise ProtocolError(
-            f"the sequence number must be in 1..{LAST_SEQUENCE}, got {words[0]!r} in the line {line!r}", Code.ARGUMENTS
-        )
+        raise ProtocolError(f"the sequence number of {line!r} must be in 1..{LAST_SEQUENCE}", Code.ARGUMENTS)
     match words[1:]:
-        case ["HELLO", version] if (number := _number(version, 0, 65535)) is not None:
+        case ["HELLO", version] if (number := _number(version, 0, _UINT16)) is not None:
             return Hello(sequence, number)
         case ["SET", *values] if (levels := _levels(values)) is not None:
             return Set(sequence, levels)
@@ -238,24 +185,12 @@ def decode_request(line: bytes) -> Request:
         case ["WATCH", period] if (number := _number(period, SHORTEST_WATCH_MS, LONGEST_WATCH_MS)) is not None:
             return Watch(sequence, number)
         case ["HELLO" | "SET" | "PING" | "WATCH", *_]:
-            raise ProtocolError(
-                f"the line {line!r} has a wrong number of arguments or an argument that is out of range: HELLO needs "
-                f"a version in 0..65535, SET needs {CHANNELS} levels in 0..255, PING needs no arguments, and WATCH "
-                f"needs a period in {SHORTEST_WATCH_MS}..{LONGEST_WATCH_MS} ms",
-                Code.ARGUMENTS,
-                sequence,
-            )
-    raise ProtocolError(
-        f"the command in the line {line!r} is unknown: it must be HELLO, SET, PING or WATCH", Code.COMMAND, sequence
-    )
+            raise ProtocolError(f"wrong number or range of arguments in {line!r}", Code.ARGUMENTS, sequence)
+    raise ProtocolError(f"unknown command in {line!r}", Code.COMMAND, sequence)
 
 
 def encode_reply(reply: Reply) -> bytes:
-    """Encode a reply as a line with its checksum and newline.
-
-    Raises:
-        ProtocolError: A value of the reply is out of range.
-    """
+    """Encode a reply as a line with its checksum and newline."""
     match reply:
         case Controller(sequence, version, firmware, board, serial_number, channels):
             text = f"{sequence} OK HELLO {version} {firmware} {board} {serial_number} {channels}"
@@ -275,22 +210,11 @@ def encode_reply(reply: Reply) -> bytes:
 
 
 def decode_reply(line: bytes) -> Reply:
-    """Decode a reply from a line.
-
-    Args:
-        line: The whole line, with its checksum and newline.
-
-    Raises:
-        ProtocolError: The line is not a valid reply.
-    """
-    found = _reply(decode(line).split(" "))
-    if found is None:
-        raise ProtocolError(
-            f"the line {line!r} is not a reply of the LED controller's protocol: compare it with the replies in "
-            "docs/hardware/protocol.md",
-            Code.ARGUMENTS,
-        )
-    return found
+    """Decode a reply from a line with its checksum and newline."""
+    reply = _reply(decode(line).split(" "))
+    if reply is None:
+        raise ProtocolError(f"the line {line!r} is not a reply of the LED controller's protocol", Code.ARGUMENTS)
+    return reply
 
 
 def _reply(words: list[str]) -> Reply | None:
@@ -315,12 +239,9 @@ def _reply(words: list[str]) -> Reply | None:
     return None
 
 
-_UINT32 = 2**32 - 1
-
-
 def _controller(sequence: int, values: list[str]) -> Controller | None:
     """Decode the reply to HELLO. In all versions of the protocol, its first value is the version."""
-    version = _number(values[0], 0, 65535) if values else None
+    version = _number(values[0], 0, _UINT16) if values else None
     if version is None:
         return None
     if version != VERSION:
@@ -334,7 +255,7 @@ def _controller(sequence: int, values: list[str]) -> Controller | None:
 
 def _state(sequence: int, values: list[str], *, timed: bool) -> State | None:
     levels = _levels(values[:CHANNELS])
-    counter, boot = _number(values[CHANNELS], 0, _UINT32), _number(values[CHANNELS + 1], 0, 65535)
+    counter, boot = _number(values[CHANNELS], 0, _UINT32), _number(values[CHANNELS + 1], 0, _UINT16)
     uptime_ms = _number(values[CHANNELS + 2], 0, _UINT32) if timed else None
     if levels is None or counter is None or boot is None or (timed and uptime_ms is None):
         return None

@@ -30,7 +30,6 @@ from jaxtyping import Int, UInt8
 
 from sts_jax import optics, storage
 from sts_jax.hardware import protocol
-from sts_jax.hardware.camera import CameraConfig, device_path, stable_path
 from sts_jax.hardware.guide import End
 from sts_jax.hardware.leds import Lit
 from sts_jax.hardware.lens import Lens, rectified
@@ -65,17 +64,15 @@ class Origin:
     def of(cls, sensor: STS) -> "Origin":
         """The identity of a connected sensor. Reads one frame to find the image size."""
         height, width = sensor.camera.async_read().image.shape[:2]
-        return cls(_name(sensor.camera.config), sensor.leds.serial_number, width, height, sensor.levels)
+        return cls(_name(sensor.camera.source), sensor.leds.serial_number, width, height, sensor.levels)
 
 
-def _name(config: CameraConfig) -> str:
-    """A name of a camera that stays the same if the camera is replugged or its server uses another network port."""
-    if config.kind == "stream":
-        url = urllib.parse.urlsplit(str(config.source))
-        return urllib.parse.urlunsplit((url.scheme, url.hostname or "", url.path, url.query, ""))
-    if config.kind == "device":
-        return str(stable_path(device_path(config.target)))
-    return config.name
+def _name(source: str) -> str:
+    """A name of a camera that stays the same if its server uses another network port."""
+    if "://" not in source:
+        return source
+    url = urllib.parse.urlsplit(source)
+    return urllib.parse.urlunsplit((url.scheme, url.hostname or "", url.path, url.query, ""))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -60,7 +60,7 @@ class VirtualSensor:
 
         Raises:
             ValueError: A level is out of range, or all levels are 0.
-            NoContrastError: The lights do not change the image.
+            LightError: The lights do not change the image.
             RuntimeError: The twin runs on the real clock.
         """
         self._twin = twin
