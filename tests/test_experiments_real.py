@@ -220,7 +220,7 @@ def test_other_sites_can_neither_see_nor_press(page):
 
 
 def test_an_address_in_use_is_named(page):
-    with pytest.raises(OSError, match=rf"cannot be served at 127.0.0.1:{page.port} .*give another --host or --port"):
+    with pytest.raises(OSError, match=rf"cannot listen on 127.0.0.1, port {page.port} .*choose another host or port"):
         CollectPage("127.0.0.1", page.port)
 
 

@@ -1,17 +1,14 @@
-"""The browser pages of `experiments.real collect` and `experiments.live`, and the small web server of both.
+"""The browser pages of `experiments.real collect` and `experiments.live`.
 
-The server refuses requests for another host name, and actions without the HTTP header that the page sends. Another site
-in the same browser can therefore neither see the images nor press the buttons.
+Other sites in the same browser can neither see the images nor press the buttons (`hardware.web`). Actions need an HTTP
+header that only the page itself can send, too.
 """
 
 import abc
 import contextlib
-import http.server
-import ipaddress
 import json
 import threading
 import time
-import urllib.parse
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -21,14 +18,13 @@ from jaxtyping import UInt8
 
 from experiments.shared.live import Seen
 from experiments.shared.terminal import say
-from sts_jax.hardware import Action, View
+from sts_jax.hardware import Action, View, web
 
 _WIDEST = 820  # largest width of the images in the page (pixels)
 _QUALITY = 80  # JPEG quality
 _INTERVAL_S = 0.1  # time between two images of a stream (s)
 _OPEN_S = 2.0  # time since the last request for facts after which the page counts as closed (s)
 _LAST_S = 0.4  # time at the end in which open pages can request the last facts (s)
-_SILENT_S = 10.0  # time after which a connection that sends or takes nothing is closed (s)
 _LARGEST = 1000  # largest size of a request's content (bytes)
 
 Image = UInt8[np.ndarray, "height width 3"]
@@ -49,13 +45,7 @@ class Page(abc.ABC, Generic[State]):
         self._ended = False
         self._asked_s = -float("inf")  # time of the last request for facts, on the clock `time.monotonic` (s)
         handler = type("Handler", (_Handler,), {"page": self})
-        try:
-            self._server = http.server.ThreadingHTTPServer((host, port), handler)
-        except (OSError, OverflowError) as error:
-            raise OSError(
-                f"the page cannot be served at {host}:{port} ({error}): give another --host or --port, or --headless"
-            ) from error
-        self._server.daemon_threads = True
+        self._server = web.Server(host, port, handler)
         self.host, self.port = host, self._server.server_port
         self._thread = threading.Thread(target=self._server.serve_forever, name="page", daemon=True)
         self._thread.start()
@@ -80,20 +70,13 @@ class Page(abc.ABC, Generic[State]):
 
     def announce(self, what: str) -> None:
         """Print the address of the page, and who can do there `what`, such as "watch"."""
-        reach = "only this computer" if self.is_local else "EVERY computer that reaches this address"
+        reach = "only this computer" if self._server.is_local else "EVERY computer that reaches this address"
         say(f"open {self.url} in a browser. The page listens on {self.host}, so {reach} can {what}")
 
     @property
     def url(self) -> str:
         """The address of the page."""
-        return f"http://{self.host}:{self.port}/"
-
-    @property
-    def is_local(self) -> bool:
-        """True if only programs on this computer can reach the page."""
-        with contextlib.suppress(ValueError):
-            return ipaddress.ip_address(self.host).is_loopback
-        return self.host == "localhost"
+        return self._server.url + "/"
 
     def newest(self) -> State | None:
         """The newest state, or None before the first one."""
@@ -123,30 +106,24 @@ class Page(abc.ABC, Generic[State]):
         self._thread.join()
 
 
-class _Handler(http.server.BaseHTTPRequestHandler):
+class _Handler(web.Handler):
     """Answers the requests of the page."""
 
     page: Page
-    timeout = _SILENT_S
-
-    def log_message(self, *_: object) -> None:
-        """Do not log requests."""
 
     def do_GET(self) -> None:
         """Send the HTML page, its facts, an image or a stream."""
         path = self.path.partition("?")[0].removeprefix("/")
         name, _, kind = path.rpartition(".")
         with contextlib.suppress(OSError):  # the browser may have closed the connection
-            if not self._is_own_name():
-                self.send_error(403, "Open the page at the address that the program has printed")
-            elif path == "":
-                self._send("text/html; charset=utf-8", self.page.document.read_bytes())
+            if path == "":
+                self.send("text/html; charset=utf-8", self.page.document.read_bytes())
             elif path == "view":
-                self._send("application/json", json.dumps(self.page.answer()).encode())
+                self.send("application/json", json.dumps(self.page.answer()).encode())
             elif kind == "mjpg" and name in self.page.streams:
                 self._stream(name)
             elif kind == "jpg" and (image := self._image(name)) is not None:
-                self._send("image/jpeg", _jpeg(image))
+                self.send("image/jpeg", _jpeg(image))
             else:
                 self.send_error(404)
 
@@ -154,7 +131,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         """Pass an action of the page to `Page.pressed`."""
         length = self.headers.get("Content-Length", "")
         with contextlib.suppress(OSError):
-            if not self._is_own_name() or self.path != "/action" or self.headers.get("X-Collect") != "1":
+            if self.path != "/action" or self.headers.get("X-Collect") != "1":
                 self.send_error(403)
                 return
             if not length.isdecimal() or int(length) > _LARGEST:
@@ -168,43 +145,19 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             self.send_response(204 if self.page.pressed(self.page.newest(), content) else 409)
             self.end_headers()
 
-    def _is_own_name(self) -> bool:
-        """Return whether the request names this server as its host, and not another site."""
-        name, host = "", self.page.host
-        with contextlib.suppress(ValueError):
-            name = urllib.parse.urlsplit("//" + self.headers.get("Host", "")).hostname or ""
-        if name == host or (self.page.is_local and name in ("localhost", "127.0.0.1", "::1")):
-            return True
-        with contextlib.suppress(ValueError):  # a server on 0.0.0.0 has all addresses of this computer
-            return host in ("0.0.0.0", "::") and bool(ipaddress.ip_address(name))
-        return False
-
     def _image(self, path: str) -> Image | None:
         state = self.page.newest()
         return None if state is None else self.page.image(state, path)
 
-    def _send(self, kind: str, data: bytes) -> None:
-        self.send_response(200)
-        self.send_header("Content-Type", kind)
-        self.send_header("Content-Length", str(len(data)))
-        self.send_header("Cache-Control", "no-store")
-        self.send_header("X-Content-Type-Options", "nosniff")
-        self.end_headers()
-        self.wfile.write(data)
-
     def _stream(self, stream: str) -> None:
-        self.send_response(200)
-        self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
-        self.send_header("Cache-Control", "no-store")
-        self.end_headers()
+        self.begin_stream()
         number, shown = 0, None
         while (changed := self.page.wait(number)) is not None:
             number, image = changed, self._image(stream)
             if image is None or image is shown:
                 continue
-            shown, data = image, _jpeg(image)
-            head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
-            self.wfile.write(head.encode() + data + b"\r\n")
+            shown = image
+            self.send_frame(_jpeg(image))
             time.sleep(_INTERVAL_S)
 
 

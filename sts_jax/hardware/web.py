@@ -1,7 +1,7 @@
 """A small HTTP server that pages of other sites cannot read or use: the base of the twin's server and of the pages.
 
 `Handler` answers only requests for the server's own name (against DNS rebinding) that no foreign page has sent
-(against cross-site requests). The pages of `experiments` derive their handler from it, too.
+(against cross-site requests). `experiments/shared/page.py` derives its handler from it, too.
 """
 
 import contextlib
@@ -17,7 +17,6 @@ class Server(http.server.ThreadingHTTPServer):
     """A server with a thread per connection. A client that goes away leaves no trace."""
 
     daemon_threads = True
-    allow_reuse_address = True
 
     def __init__(self, host: str, port: int, handler: type["Handler"]):
         """Listen on an address. Port 0 selects a free one."""
