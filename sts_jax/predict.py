@@ -101,7 +101,7 @@ class Predictor:
         path = _located(folder)
         model = training.load(path)
         try:
-            preprocessing = training.preprocessing_from_json(model.settings.get("preprocessing", {}))
+            preprocessing = training.Preprocessing.from_json(model.settings["preprocessing"])
         except ValueError as error:
             raise ValueError(f"the field 'preprocessing' of {path / 'config.json'} is not valid: {error}") from error
         for field, asked in (("resolution", resolution and tuple(resolution)), ("crop", crop)):
@@ -143,7 +143,7 @@ class Predictor:
         params, stats = nnx.split_state(self.model.state, nnx.Param, nnx.BatchStat)
         training.save_blank(folder, *self._images)
         storage.write_json(folder / "config.json", settings)
-        training.save(folder, training.Weights(params, stats, jnp.int32(self.model.step)), compact=compact)
+        training.save(folder, training.TrainState(params, stats, None, jnp.int32(self.model.step)), compact=compact)
         if self.model.calibration is not None:
             training.save_calibration(folder, self.model.calibration, self._inputs)
 

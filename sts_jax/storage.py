@@ -190,35 +190,27 @@ def read_arrays(path: Path, remedy: str) -> dict[str, np.ndarray]:
         raise DamagedFileError(f"{path} is damaged ({error}): {remedy}.") from error
 
 
-def claim(path: Path, content: dict, *, labels: tuple[str, ...] = ()) -> None:
+def claim(path: Path, content: dict) -> None:
     """Record settings in a JSON file, or check that an existing file has the same settings.
 
-    The check ensures that all results in a folder have the same settings. A field may be missing from the existing file
-    if its value in `content` is an empty list or dictionary, or if `labels` contains its name.
+    The check ensures that all results in a folder have the same settings.
 
     Args:
         path: The file.
         content: The settings, of JSON types. Tuples count as lists.
-        labels: Dotted names of fields that do not influence the results, such as `model.outcome_names`.
-
-    Raises:
-        ValueError: The settings in the existing file differ. The message names all fields that differ, and the remedy.
-            For the first three of these fields, the message contains the old and the new value.
-        DamagedFileError: The existing file cannot be read or is not JSON.
-        OSError: The file cannot be written.
     """
     content = json.loads(json.dumps(content))
     if not path.exists():
         write_json(path, content)
         return
-    there = read_json(path, f"delete {path.parent}, or choose another folder")
-    found = [change for change in _differences(there, content) if not (change[0] in labels and change[1] is None)]
-    if found:
-        made = ", ".join(f"{field or 'content'} = {old!r}" for field, old, _ in found[:_SHOWN])
-        asked = ", ".join(f"{field or 'content'} = {new!r}" for field, _, new in found[:_SHOWN])
-        more = f" (also different: {', '.join(field for field, _, _ in found[_SHOWN:])})" if found[_SHOWN:] else ""
+    recorded = read_json(path, f"delete {path.parent}, or choose another folder")
+    changes = list(_differences(recorded, content))
+    if changes:
+        old = ", ".join(f"{field or 'content'} = {value!r}" for field, value, _ in changes[:_SHOWN])
+        new = ", ".join(f"{field or 'content'} = {value!r}" for field, _, value in changes[:_SHOWN])
+        more = f" (also different: {', '.join(field for field, *_ in changes[_SHOWN:])})" if changes[_SHOWN:] else ""
         raise ValueError(
-            f"{path} was made with {made}, but the current settings have {asked}{more}: "
+            f"{path} was made with {old}, but the current settings have {new}{more}: "
             f"choose another folder, or delete {path.parent} to start again."
         )
 
@@ -229,7 +221,7 @@ _SHOWN = 3  # number of differing fields whose values a message contains
 def _differences(old: object, new: object, field: str = "") -> Iterator[tuple[str, object, object]]:
     """Yield each field in which two contents differ: its dotted name, the old value and the new value."""
     if isinstance(old, dict) and isinstance(new, dict):
-        for key in [*old, *(key for key in new if key not in old and new[key] not in ([], {}))]:
+        for key in dict.fromkeys([*old, *new]):
             yield from _differences(old.get(key), new.get(key), f"{field}.{key}".lstrip("."))
     elif old != new:
         yield field, old, new

@@ -232,7 +232,7 @@ def test_values_that_were_not_measured_are_masked():
     )
     assert preprocessing.absent == ("late",)
     assert preprocessing.scales == (("load", 50.0), ("late", 50.0))
-    assert training.preprocessing_from_json(dataclasses.asdict(preprocessing)) == preprocessing
+    assert training.Preprocessing.from_json(dataclasses.asdict(preprocessing)) == preprocessing
     assert set(arrays.inputs) == {"load"}
     np.testing.assert_array_equal(arrays.present["load"], [False, True, True])
     np.testing.assert_array_equal(arrays.target_present["load"], [True, False, True])

@@ -119,7 +119,7 @@ def test_a_folder_is_not_resumed_with_another_loss_optimiser_or_note(tmp_path):
     with pytest.raises(ValueError, match=r"notes\.optimiser = 'Adam, 1e-3', but .* 'Adam, 1e-2'"):
         run(optimiser=optax.adam(1e-2), notes={"optimiser": "Adam, 1e-2"})
     for other in (optax.sgd(1e-3), optax.sgd(1e-3, momentum=0.9), optax.lion(1e-3)):
-        with pytest.raises(ValueError, match=r"has no state of this optimiser .* Give the optimiser that the training"):
+        with pytest.raises(ValueError, match=r"has no state of this optimiser .* give the optimiser that the training"):
             run(optimiser=other, notes=notes)
     assert training.load(tmp_path).step == 4
     assert run(optimiser=adam, notes=notes).step == 6
@@ -142,7 +142,7 @@ def test_a_loss_without_its_own_value_among_its_parts_is_refused(tmp_path):
         total = optax.tree.norm(params)
         return total, (stats, {"size": total})
 
-    with pytest.raises(ValueError, match=r"returned the parts \['size'\], but one part must have the name 'loss'"):
+    with pytest.raises(ValueError, match=r"returned the parts \['size'\], but one must have the name 'loss'"):
         training.train(CONFIG, MODEL, arrays(), workdir=tmp_path, loss=loss)
 
 

@@ -535,11 +535,6 @@ def test_any_flipped_bit_in_compact_weights_is_found_and_named(compact, tmp_path
         weights.write_bytes(flipped)
         with pytest.raises(OSError, match=r"weights\.npz is not the file that manifest\.json lists"):
             sts.Predictor.load(folder)
-    weights.write_bytes(whole[:1000])
-    (folder / "manifest.json").unlink()
-    training.seal(folder)
-    with pytest.raises(ValueError, match=r"00000000 cannot be read \(BadZipFile.*damaged before the checksums"):
-        sts.Predictor.load(folder)
     weights.unlink()
     with pytest.raises(OSError, match=r"weights\.npz is missing"):
         sts.Predictor.load(folder)

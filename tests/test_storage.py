@@ -123,21 +123,6 @@ def test_other_settings_are_refused_and_equal_ones_are_not(tmp_path):
         storage.claim(path, {"seed": 0})
 
 
-def test_settings_of_an_older_version_may_lack_empty_fields_and_labels(tmp_path):
-    path = tmp_path / "config.json"
-    storage.claim(path, {"model": {"size": 3}})
-    storage.claim(path, {"model": {"size": 3, "scales": (), "more": {}}})
-    named = {"model": {"size": 3, "names": ["a", "b"]}}
-    storage.claim(path, named, labels=("model.names",))
-    with pytest.raises(ValueError, match=r"model\.names = None, but the current settings have .* \['a', 'b'\]"):
-        storage.claim(path, named)
-    storage.write_json(path, {"model": {"size": 3, "names": ["a", "c"], "scales": [1]}})
-    with pytest.raises(ValueError, match=r"model\.names = \['a', 'c'\]"):
-        storage.claim(path, {"model": {"size": 3, "names": ["a", "b"], "scales": [1]}}, labels=("model.names",))
-    with pytest.raises(ValueError, match=r"model\.scales = \[1\], but the current settings have model\.scales = None"):
-        storage.claim(path, {"model": {"size": 3, "names": ["a", "c"]}}, labels=("model.names",))
-
-
 def test_a_checksum_is_that_of_the_content(tmp_path):
     path = tmp_path / "a"
     path.write_bytes(b"abc")  # the example of FIPS 180-4

@@ -4,6 +4,8 @@ import dataclasses
 
 import numpy as np
 import pytest
+from jaxtyping import TypeCheckError
+from recorded_session import SQUARE, drawn
 
 from sts_jax import training
 
@@ -70,9 +72,39 @@ def test_image_arrays_are_first_inputs_and_last_targets_and_mask_first_touches_w
     assert alone.present == {}
 
 
-def test_image_arrays_refuse_poses_and_other_shapes():
+@pytest.mark.parametrize(
+    ("modalities", "resolution", "message"),
+    [(("visual", "pose"), (64, 64), "modalities must be one or both of"), (("visual",), (32, 32), "resize the images")],
+)
+def test_image_arrays_refuse_poses_and_other_shapes(modalities, resolution, message):
     images, blank = np.zeros((3, 2, 64, 64, 3), np.uint8), np.zeros((64, 64, 3), np.uint8)
-    with pytest.raises(ValueError, match="modalities must contain at least one of the names 'visual' and"):
-        training.image_arrays(images, images, ("visual", "pose"), training.Preprocessing(), blank)
-    with pytest.raises(ValueError, match="visual is uint8 of shape"):
-        training.image_arrays(images, images, ("visual",), training.Preprocessing((32, 32)), blank)
+    with pytest.raises(ValueError, match=message):
+        training.image_arrays(images, images, modalities, training.Preprocessing(resolution), blank)
+
+
+EMPTY = np.clip(drawn(None, None) + np.arange(64)[:, None, None], 0, 255).astype(np.uint8)  # light that varies
+
+
+def with_square(row, column):
+    """The empty pad with a square that is 100 darker, or as far as it is in view."""
+    image = EMPTY.copy()
+    rows, columns = (slice(max(x, 0), max(x + SQUARE, 0)) for x in (row, column))
+    image[rows, columns] -= 100
+    return image
+
+
+@pytest.mark.parametrize("shift", [(0, 0), (3, 0), (0, -5), (-12, 40)])
+def test_a_shifted_trajectory_is_the_one_at_the_other_place(shift):
+    images = np.stack([[with_square(10, 15), with_square(20, 15)]])
+    moved = training.shifted(images, EMPTY, np.array([shift]))
+    rows, columns = shift
+    truth = np.stack([with_square(10 + rows, 15 + columns), with_square(20 + rows, 15 + columns)])
+    np.testing.assert_array_equal(moved[0], truth)
+
+
+def test_invalid_shapes_and_shifts_are_refused():
+    images = np.stack([[EMPTY, EMPTY]])
+    with pytest.raises(ValueError, match=r"must be below \(64, 64\)"):
+        training.shifted(images, EMPTY, np.array([[64, 0]]))
+    with pytest.raises(TypeCheckError, match="shifts"):
+        training.shifted(images, EMPTY, np.array([[1, 0], [2, 0]]))

@@ -14,7 +14,6 @@ from experiments.shared.config import MODELS, NONE, TITLES, Extensions, Run
 from experiments.shared.terminal import Bar, say
 from sts_jax import dataset, evaluation, storage, training
 from sts_jax.dataset.measurement import NAMES
-from sts_jax.training import records
 
 # The main table has rows for the main model with the first five of these inputs that the model supports.
 MAIN_SUBSETS = (
@@ -70,7 +69,7 @@ def record(folder: Path, part: str, inputs: Mapping[str, str], files: Sequence[P
 
 def identity(model: Path) -> str:
     """SHA-256 that changes with every file of a model: its manifest has their checksums, and its log is short."""
-    names = ("manifest.json", "calibration.json", records.NAME)
+    names = ("manifest.json", "metrics.jsonl")
     return storage.digest({name: storage.sha256(model / name) for name in names if (model / name).exists()})
 
 
@@ -120,7 +119,7 @@ def evaluate(run: Run, data: dataset.Dataset, own: Extensions = NONE) -> str:
         summary = evaluation.summarise(scores, test, metrics=own.scored, outcomes=scenario.outcomes)
         bar("evaluate", len(predicted), len(predicted), "intervals done")
 
-    logs = {TITLES[name]: records.read(run.folder(name) / records.NAME) for name in MODELS[config.model]}
+    logs = {TITLES[name]: training.records(run.folder(name)) for name in MODELS[config.model]}
     figures = drawing.draw(run, test, scores, shown, rerolls.pose)
     figures.append(run.figures / "training.png")
     evaluation.figures.training_curves(figures[-1], logs)

@@ -18,7 +18,7 @@ from sts_jax import evaluation, hardware, storage, training
 from sts_jax.evaluation import Predicted
 from sts_jax.hardware import SensorView, twin
 from sts_jax.predict import MODELS as SHIPPED
-from sts_jax.training import TrainConfig, records
+from sts_jax.training import TrainConfig
 
 NAMES = ("vae-visual", "vae-tactile", "mvae-without-pose")  # the rows of the paper's Table 2
 SIMULATED = "released"  # model of the library that was trained on simulated images only
@@ -243,7 +243,7 @@ def evaluate(config: Config, data: Recorded, workdir: Path, folder: Path) -> str
         predicted[SIMULATED_TITLE] = transfer
     baselines = evaluation.image_baselines(data.train, data.validation)
     summary = evaluation.image_summary({**baselines, **predicted}, data.validation)
-    logs = {TITLES[name]: records.read(path / records.NAME) for name, path in models.items()}
+    logs = {TITLES[name]: training.records(path) for name, path in models.items()}
     figures = [folder / "figures" / name for name in ("predictions.png", "training.png")]
     draw(config, data, predicted, figures[0])
     evaluation.figures.training_curves(figures[1], logs)

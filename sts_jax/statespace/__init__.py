@@ -6,7 +6,7 @@ and tactile images of the last frame.
 """
 
 from sts_jax.statespace.calibration import Calibration
-from sts_jax.statespace.config import IMAGES, INPUTS, Config
+from sts_jax.statespace.config import IMAGES, INPUTS, Config, LossWeights
 from sts_jax.statespace.fitting import fit as fit_calibration
 from sts_jax.statespace.layers import CONTRAST
 from sts_jax.statespace.networks import Model, init
@@ -24,6 +24,7 @@ __all__ = [
     "STATE_CODE",
     "Calibration",
     "Config",
+    "LossWeights",
     "Model",
     "Samples",
     "encode",

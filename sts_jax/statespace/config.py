@@ -9,16 +9,24 @@ from sts_jax.statespace import harmonics
 IMAGES = ("visual", "tactile")  # names of the images
 INPUTS = (*IMAGES, "pose")  # names of all inputs that a model can have
 TINT = 3  # numbers of the tint
-_ADDED = (("vectors", 1), ("outcome_names", ()))  # fields that older versions lack, and their default values
+
+
+@dataclasses.dataclass(frozen=True)
+class LossWeights:
+    """Weights of the terms of the loss, see `objective`. The term `visual` has the weight 1."""
+
+    tactile: float = 4.0  # error of the last tactile image
+    state: float = 16.0  # squared error of each encoder's state code
+    pose: float = 4.0  # negative log likelihoods of the final pose and of the encoders' estimates
+    outcome: float = 8.0  # negative log likelihood of the outcome
+    covered: float = 0.15  # cross-entropy of the object's outline
+    first: float = 0.5  # errors of the images of the first frame
+    look: float = 0.1  # divergence of the appearance code. Below 1, samples are sharper
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """The configuration of a state-space model, in values that JSON can represent.
-
-    Raises:
-        ValueError: A field is out of range, or the values of two fields do not fit together.
-    """
+    """The configuration of a state-space model, in values that JSON can represent."""
 
     inputs: tuple[str, ...] = ("visual", "pose")  # some of `visual`, `tactile` and `pose`, in this order
     outcomes: int = 2  # number of outcomes of the scenario
@@ -42,13 +50,7 @@ class Config:
     transition: int = 512  # width of the transition's layers
     canvas: int = 64  # pixels, side of the canvas: the image of an object before it is placed in the view
     canvas_side: float = 0.165  # m, side of the square parallel to the pad that the canvas covers
-    tactile_weight: float = 4.0  # weight of the error of the last tactile image in the loss
-    state_weight: float = 16.0  # weight of the squared error of each encoder's state code
-    pose_weight: float = 4.0  # weight of the negative log likelihoods of the final pose and of the encoders' estimates
-    outcome_weight: float = 8.0  # weight of the negative log likelihood of the outcome
-    covered_weight: float = 0.15  # weight of the cross-entropy of the object's outline
-    first_weight: float = 0.5  # weight of the errors of the images of the first frame
-    look_weight: float = 0.1  # weight of the divergence of the appearance code. Below 1, samples are sharper
+    weights: LossWeights = LossWeights()  # of the terms of the loss
     drawn: float = 0.4375  # share of a batch with a rendered last frame (the whole batch trains the other parts)
     drawn_first: float = 0.125  # share of a batch with a rendered first frame
     vectors: int = 1  # number of vectors (x, y) in the plane of the pad with which the condition begins
@@ -56,60 +58,39 @@ class Config:
     outcome_names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if not self.inputs or [name for name in INPUTS if name in self.inputs] != list(self.inputs):
-            raise ValueError(f"inputs is {self.inputs}, but it must be one or more of {INPUTS}, in this order")
-        if not set(self.inputs) & set(IMAGES):
-            raise ValueError(
-                f"inputs is {self.inputs}, but at least one input must be an image: add 'visual' or 'tactile'"
-            )
+        if [name for name in INPUTS if name in self.inputs] != list(self.inputs) or not set(self.inputs) & set(IMAGES):
+            raise ValueError(f"inputs must be some of {INPUTS} in this order, with an image, got {self.inputs}")
         for name, part in (("window", 8), ("canvas", 8), ("input_size", self.image_size)):
             if getattr(self, name) % part or getattr(self, name) < part:
                 raise ValueError(
-                    f"{name} is {getattr(self, name)} pixels, but it must be a positive multiple of {part}"
-                    f"{', the image_size' if name == 'input_size' else ''}"
+                    f"{name} must be a positive multiple of {part} pixels"
+                    f"{', the image_size' if name == 'input_size' else ''}, got {getattr(self, name)}"
                 )
         if len(self.encoder) != 3 or len(self.decoder) != 3:
-            raise ValueError(
-                f"encoder has {len(self.encoder)} widths and decoder has {len(self.decoder)}, but each must have 3 "
-                "widths, one for each resolution of the network"
-            )
+            raise ValueError(f"encoder and decoder must have 3 widths each, got {self.encoder} and {self.decoder}")
         if self.condition < 0 or (self.condition and not 0 <= 2 * self.vectors <= self.condition):
             raise ValueError(
-                f"condition is {self.condition} and vectors is {self.vectors}, but they must satisfy condition >= "
-                "2 * vectors >= 0. Set condition to len(scenario.condition_scale), the number of known quantities of "
-                "a trajectory, and vectors to scenario.vectors"
+                f"condition must be >= 2 * vectors >= 0, got condition={self.condition} and vectors={self.vectors}: "
+                "set condition to len(scenario.condition_scale) and vectors to scenario.vectors"
             )
         if self.traits < TINT:
-            raise ValueError(
-                f"traits is {self.traits}, but it must be >= {TINT}, because the first {TINT} traits describe the mean "
-                "colour of the object"
-            )
+            raise ValueError(f"traits must be >= {TINT}, because the first {TINT} are the tint, got {self.traits}")
         if self.outcome_names and len(self.outcome_names) != self.outcomes:
-            raise ValueError(
-                f"outcome_names is {self.outcome_names}, but outcomes, the number of outcomes, is {self.outcomes}: "
-                "give one name for each outcome, or an empty tuple"
-            )
+            raise ValueError(f"outcome_names must be empty or have {self.outcomes} names, got {self.outcome_names}")
         for name in ("drawn", "drawn_first"):
             if not 0 < getattr(self, name) <= 1:
-                raise ValueError(
-                    f"{name} is {getattr(self, name)}, but it must be > 0 and <= 1, because it is a share of a batch"
-                )
+                raise ValueError(f"{name} is a share of a batch, > 0 and <= 1, got {getattr(self, name)}")
 
     @property
     def look(self) -> int:
-        """Number of values in the appearance code, which describes the visible properties other than pose and shape."""
+        """Number of values in the appearance code."""
         return self.traits + (self.own + self.shown) * harmonics.number(self.degree)
 
     def to_json(self) -> dict[str, Any]:
-        """The fields by name, in values that `json.dumps` accepts.
-
-        A field that older versions of the library did not have (`vectors` or `outcome_names`) is left out if it has its
-        default value, so that the result equals a configuration that an older version saved.
-        """
-        values = dataclasses.asdict(self)
-        return {name: value for name, value in values.items() if (name, value) not in _ADDED}
+        """The fields by name, in values that `json.dumps` accepts."""
+        return dataclasses.asdict(self)
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> "Config":
-        """Make a configuration from the result of `to_json`, or from the same values read from a JSON file."""
+        """Make a configuration from the result of `to_json`, or from the same values of a JSON file."""
         return storage.decode(cls, values, "model")

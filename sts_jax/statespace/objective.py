@@ -40,7 +40,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from sts_jax.mvae import Gaussian, kl_standard_normal, product_of_experts
 from sts_jax.statespace import poses, state, window
-from sts_jax.statespace.config import IMAGES, TINT, Config
+from sts_jax.statespace.config import IMAGES, TINT, LossWeights
 from sts_jax.statespace.layers import compose
 from sts_jax.statespace.networks import UNKNOWN_LOG_VAR, FinalPose, Model
 
@@ -296,20 +296,22 @@ def loss(
         own = fuse(jax.tree.map(lambda x: x[:first], seen), known)
         before = _present_pictures(views["state"][:first], own, {"visual": views["visual"][:first]}, known)
     terms |= _picture_terms(model, (noise, other), after, before, empty)
-    return _weighted(config, terms, beta), terms
+    return _weighted(config.weights, terms, beta), terms
 
 
-def _weighted(config: Config, terms: dict[str, Float[Array, ""]], beta: float | Float[Array, ""]) -> Float[Array, ""]:
+def _weighted(
+    weights: LossWeights, terms: dict[str, Float[Array, ""]], beta: float | Float[Array, ""]
+) -> Float[Array, ""]:
     """The weighted sum of the terms."""
     return (
         terms["visual"]
-        + config.tactile_weight * terms["tactile"]
-        + config.covered_weight * terms["covered"]
-        + config.first_weight * terms["first"]
-        + config.state_weight * terms["state"]
-        + config.pose_weight * (terms["doubt"] + terms["pose"])
-        + config.outcome_weight * terms["outcome"]
-        + beta * config.look_weight * terms["look"]
+        + weights.tactile * terms["tactile"]
+        + weights.covered * terms["covered"]
+        + weights.first * terms["first"]
+        + weights.state * terms["state"]
+        + weights.pose * (terms["doubt"] + terms["pose"])
+        + weights.outcome * terms["outcome"]
+        + beta * weights.look * terms["look"]
     )
 
 

@@ -15,14 +15,7 @@ Batch = dict[str, Any]  # the fields of `Arrays` by name, with the samples of on
 class Arrays:
     """A training set in memory.
 
-    `inputs` and `targets` are dictionaries of arrays by name, such as `visual`, `tactile` or `pose`. `present` and
-    `target_present` are dictionaries of Boolean arrays. `present[name]` is True for each sample that has the input
-    `name`, and `target_present[name]` is True for each sample that has the target `name`. `condition` has the known
-    quantities of each sample, such as an acceleration of the pad, or is None. The first axis of all these arrays is the
-    sample. Images are uint8, or float32 in [0, 1].
-
-    Raises:
-        ValueError: The arrays have different numbers of samples, or no samples.
+    The first axis of all arrays is the sample. Images are uint8, or float32 in [0, 1].
     """
 
     inputs: dict[str, np.ndarray]  # inputs of the model, from first frames
@@ -42,29 +35,20 @@ class Arrays:
     falls: dict[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        sizes = {len(x) for x in jax.tree.leaves(self._tree())}
-        if len(sizes) != 1 or 0 in sizes:
-            leaves = jax.tree_util.tree_leaves_with_path(self._tree())
-            found = {jax.tree_util.keystr(path, simple=True, separator="/"): len(x) for path, x in leaves}
-            raise ValueError(
-                "all arrays must have the same length, which is the number of samples and must be at least 1, but "
-                f"{f'the lengths are {found}' if found else 'there are no arrays'}: give arrays of equal length that "
-                "are not empty"
-            )
+        leaves = jax.tree_util.tree_leaves_with_path(self._tree())
+        lengths = {jax.tree_util.keystr(path, simple=True, separator="/"): len(x) for path, x in leaves}
+        if len(set(lengths.values())) != 1 or 0 in lengths.values():
+            raise ValueError(f"all arrays must have the same number of samples, at least 1, got the lengths {lengths}")
 
     def __len__(self) -> int:
         return len(next(iter(self.targets.values())))
 
     def take(self, index: np.ndarray, **further: np.ndarray) -> Batch:
-        """Select the samples of one batch.
+        """The arrays of one batch by field. `empty` is included as a whole.
 
         Args:
             index: Indices of the samples.
-            further: Two optional keyword arguments, `views` and `falls`. Each has indices along the first axis of the
-                arrays in the field of the same name. If one of them is missing, the batch lacks this field.
-
-        Returns:
-            A dictionary from the name of each field to its selected arrays. The field `empty` is included as a whole.
+            further: Indices into the fields `views` and `falls`, which the batch lacks otherwise.
         """
         batch = jax.tree.map(lambda x: x[index], self._tree()) | {"empty": self.empty}
         return batch | {name: {k: x[rows] for k, x in getattr(self, name).items()} for name, rows in further.items()}
@@ -83,21 +67,17 @@ class Arrays:
 
 
 def order(seed: int, samples: int, batch_size: int, start: int, stop: int) -> Iterator[np.ndarray]:
-    """Iterate over the batches of a training, each as an array of sample indices.
+    """Iterate over the batches of a training, each as an array of sample indices `(batch_size,)`.
 
     Each epoch is a random permutation of all samples. A batch may contain the end of one epoch and the start of the
-    next, so that no sample is dropped. The batches of a training are numbered from 0. The samples in batch k do not
-    depend on `start` and `stop`, so that a resumed training uses the same batches.
+    next. The samples in batch k do not depend on `start` and `stop`, so that a resumed training uses the same batches.
 
     Args:
         seed: Seed of the permutations.
         samples: Number of samples.
         batch_size: Number of samples in a batch.
-        start: Number k of the first batch.
-        stop: Number k of the last batch, plus 1, as in `range(start, stop)`.
-
-    Yields:
-        Indices of the samples of one batch, `(batch_size,)`.
+        start: Number of the first batch, counted from 0.
+        stop: Number of the last batch, plus 1.
     """
     permutations: dict[int, np.ndarray] = {}
     for number in range(start, stop):

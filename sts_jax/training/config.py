@@ -1,7 +1,10 @@
-"""The options of a training run."""
+"""The options of a training run, and its default optimiser."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
+
+import jax
+import optax
 
 from sts_jax._ranges import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, check
 
@@ -11,12 +14,7 @@ _DECAY = NOT_NEGATIVE | {"below": 1.0}
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Options of a training run.
-
-    Raises:
-        ValueError: A number is out of its range, `checkpoint_every` is not a multiple of `log_every`, or `schedule` is
-            unknown.
-    """
+    """Options of a training run."""
 
     # number of gradient steps (None: the number that `epochs` needs)
     steps: int | None = field(default=None, metadata=COUNT)
@@ -62,3 +60,38 @@ class TrainConfig:
     def total(self, samples: int) -> int:
         """The number of gradient steps of the run, for a training set of `samples` samples."""
         return self.steps if self.steps is not None else self.epochs * -(-samples // self.batch_size)
+
+
+def optimiser(config: TrainConfig, total: int) -> optax.GradientTransformation:
+    """Make the default optimiser: Adam with a learning rate schedule and gradient clipping.
+
+    Args:
+        config: Options of the training.
+        total: Number of steps of the whole training. A cosine schedule reaches 0 after these steps.
+    """
+    rate: float | optax.Schedule = config.learning_rate
+    if config.schedule == "cosine":
+        if config.warmup >= total:
+            raise ValueError(
+                f"warmup must be smaller than the number of steps of a cosine schedule ({total}), got {config.warmup}"
+            )
+        rate = optax.cosine_decay_schedule(config.learning_rate, total - config.warmup)
+    if config.warmup:
+        rise = optax.linear_schedule(0.0, config.learning_rate, config.warmup)
+        rest = rate if callable(rate) else optax.constant_schedule(rate)
+        rate = optax.join_schedules([rise, rest], [config.warmup])
+
+    def adam(epsilon: float) -> optax.GradientTransformation:
+        return optax.adam(rate, b1=config.b1, b2=config.b2, eps=epsilon)
+
+    parts = {"encoders": adam(config.encoder_epsilon), "others": adam(config.epsilon)}
+    adams = optax.partition(parts, _labels)
+    return adams if config.clip is None else optax.chain(optax.clip_by_global_norm(config.clip), adams)
+
+
+def _labels(params: Any) -> Any:
+    """Label the parameters: `encoders` for the encoders of an `mvae` model, `others` for all others."""
+    paper = "decoders" in params
+    return jax.tree_util.tree_map_with_path(
+        lambda path, _: "encoders" if paper and path[0].key == "encoders" else "others", params
+    )

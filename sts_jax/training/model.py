@@ -1,5 +1,6 @@
-"""Trained models, and functions that load them from a folder. The state of the optimiser is not read."""
+"""Trained models: loading them from their folders, and the calibration of state-space models."""
 
+import contextlib
 import os
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,8 +10,8 @@ import jax.numpy as jnp
 from flax import nnx
 
 from sts_jax import mvae, statespace, storage
-from sts_jax.training import calibration_file, manifest
-from sts_jax.training.checkpoint import Weights, read, verified
+from sts_jax.training import folder
+from sts_jax.training.arrays import Arrays
 from sts_jax.training.learners import Config, learner
 
 # The configuration class of each `kind` in `config.json`
@@ -20,8 +21,8 @@ KINDS: dict[str, type[Config]] = {"mvae": mvae.Config, "statespace": statespace.
 class Model(NamedTuple):
     """A trained model.
 
-    `graphdef` and `state` are the first two arguments of the functions `mvae.predict` (for an `mvae` model) and
-    `statespace.sample` (for a state-space model).
+    `graphdef` and `state` are the first two arguments of `mvae.predict` (for an `mvae` model) and `statespace.sample`
+    (for a state-space model).
     """
 
     config: Config  # configuration of the model
@@ -32,65 +33,100 @@ class Model(NamedTuple):
     calibration: statespace.Calibration | None = None  # from `calibrate`, for state-space models
 
     def __repr__(self) -> str:
-        config, numbers = self.config, sum(x.size for x in jax.tree.leaves(self.state))
+        config, count = self.config, sum(x.size for x in jax.tree.leaves(self.state))
         if isinstance(config, mvae.Config):
-            made = ", ".join(f"{m.name} {m.kind} {m.shape}" for m in config.modalities) + f"; latent={config.latent}"
+            parts = ", ".join(f"{m.name} {m.kind} {m.shape}" for m in config.modalities) + f"; latent={config.latent}"
         else:
-            made = f"{', '.join(config.inputs)}; look={config.look}, outcomes={config.outcomes}"
-        return f"Model({made}, condition={config.condition}, {numbers:,} numbers, step={self.step})"
+            parts = f"{', '.join(config.inputs)}; look={config.look}, outcomes={config.outcomes}"
+        return f"Model({parts}, condition={config.condition}, {count:,} numbers, step={self.step})"
 
 
-def load(workdir: str | os.PathLike[str]) -> Model:
-    """Load a trained model from its folder.
+def load(workdir: str | os.PathLike[str], *, calibrated: bool = True) -> Model:
+    """Load the model at its current checkpoint, after comparing all files of its folder with their checksums.
 
-    First, all files are compared with their checksums. You can also load the model while a training runs in the folder.
-    The optimiser of the training does not matter, because the state of the optimiser is not read.
+    The optimiser's state is not read. A training may run in the folder meanwhile.
 
     Args:
-        workdir: Folder of the model, which was the `workdir` of `train`.
-
-    Returns:
-        The model at its current checkpoint.
-
-    Raises:
-        FileNotFoundError: The folder has no `config.json` or no checkpoint.
-        OSError: A file is damaged, missing or not listed in `manifest.json`.
-        ValueError: The model was written by another version of sts_jax, or the folder has no `manifest.json`.
+        workdir: Folder of the model, the `workdir` of `train`.
+        calibrated: False leaves out the calibration, and does not read its file.
     """
     workdir = Path(workdir)
     while True:
-        before = manifest.read(workdir)
+        before = folder.manifest(workdir)
         try:
-            return _load(workdir)
+            return _load(workdir, calibrated)
         except (OSError, ValueError):
-            if manifest.read(workdir) == before:
+            if folder.manifest(workdir) == before:
                 raise
             # A training replaced the checkpoint while it was read. The loop reads the new one.
 
 
-def _load(workdir: Path) -> Model:
-    path = workdir / "config.json"
+def _load(workdir: Path, calibrated: bool) -> Model:
+    path = workdir / folder.CONFIG
     if not path.exists():
         raise FileNotFoundError(f"{workdir} has no config.json: give the folder of a trained model, or train one there")
-    checkpoint = verified(workdir)
-    settings = storage.read_json(path, f"delete {workdir} and train again")
-    if checkpoint is None:
+    if folder.verified(workdir) is None:
         raise FileNotFoundError(f"{workdir} has no checkpoint: run its training until the first checkpoint is written")
+    settings = storage.read_json(path, f"delete {workdir} and train again")
     try:
-        kind = settings.get("kind", "mvae")  # version 0.1 had no other kind
-        model = KINDS[kind].from_json(settings["model"])
-        like = jax.eval_shape(lambda: Weights(*learner(model).init(jax.random.key(0))[1:], jnp.zeros((), jnp.int32)))
+        config = KINDS[settings["kind"]].from_json(settings["model"])
+        like = jax.eval_shape(lambda: _initial_weights(config))
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(
             f"{path} does not describe a model that this version of sts_jax can load ({type(error).__name__}: "
             f"{error}): use the version that trained the model, or delete {workdir} and train again"
         ) from error
-    weights = read(checkpoint, like)
-    graphdef = nnx.graphdef(nnx.eval_shape(lambda: _module(model)))
-    own = calibration_file.read(workdir)
+    weights = folder.restore(workdir, like)
+    assert weights is not None
+    graphdef = nnx.graphdef(nnx.eval_shape(lambda: _module(config)))
+    fitted = folder.read_calibration(workdir) if calibrated else None
     state = nnx.merge_state(weights.params, weights.stats)
-    return Model(model, graphdef, state, int(weights.step), settings, None if own is None else own[0])
+    return Model(config, graphdef, state, int(weights.step), settings, fitted[0] if fitted else None)
 
 
-def _module(model: Config) -> nnx.Module:
-    return mvae.MVAE(model) if isinstance(model, mvae.Config) else statespace.Model(model, nnx.Rngs(0))
+def _initial_weights(config: Config) -> folder.TrainState:
+    _, params, stats = learner(config).init(jax.random.key(0))
+    return folder.TrainState(params, stats, None, jnp.zeros((), jnp.int32))
+
+
+def _module(config: Config) -> nnx.Module:
+    return mvae.MVAE(config) if isinstance(config, mvae.Config) else statespace.Model(config, nnx.Rngs(0))
+
+
+def calibrate(workdir: str | os.PathLike[str], arrays: Arrays) -> Model:
+    """Fit the calibration of a trained state-space model, and write it to `calibration.json` in the model's folder.
+
+    For new objects, the predicted density of the final pose is too narrow, and the outcomes can be too certain or too
+    uncertain, see `statespace.fit_calibration`. If the model was calibrated on the same arrays before, nothing is
+    fitted or written.
+
+    Args:
+        workdir: Folder of the model.
+        arrays: Trajectories of objects that the model was not trained on, from `state_arrays`.
+
+    Returns:
+        The model with its calibration.
+    """
+    path = Path(workdir)
+    model = load(path, calibrated=False)
+    if not isinstance(model.config, statespace.Config):
+        raise ValueError(f"{path} has an mvae model, but only a state-space model can be calibrated")
+    learner(model.config).check(arrays)
+    checksum = arrays.checksum()
+    with contextlib.suppress(storage.DamagedFileError):  # it is fitted again
+        fitted = folder.read_calibration(path)
+        if fitted is not None and fitted[1] == checksum:
+            return model._replace(calibration=fitted[0])
+    params, _ = nnx.split_state(model.state, nnx.Param, nnx.BatchStat)
+    calibration = statespace.fit_calibration(
+        model.graphdef,
+        params,
+        arrays.inputs,
+        arrays.targets,
+        arrays.empty,
+        present=arrays.present,
+        condition=arrays.condition,
+    )
+    with storage.lock(path):
+        folder.save_calibration(path, calibration, model.config.inputs, checksum)
+    return model._replace(calibration=calibration)

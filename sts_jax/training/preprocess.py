@@ -1,8 +1,4 @@
-"""Preprocessing of images, poses and scenario conditions for the networks, and a contact test for tactile images.
-
-A scenario condition consists of the known quantities of a trajectory, such as the acceleration of the pad. The
-`config.json` of a trained model contains the values of the fields of its `Preprocessing`.
-"""
+"""Encoding of images, poses and conditions for the networks, and a contact test for tactile images."""
 
 import dataclasses
 from typing import Any, Literal
@@ -13,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8
 
 from sts_jax import geometry, storage
+from sts_jax._checked import checked
 
 # The contact test of noisy images. It has the same values as the contact test of the collection of recordings
 # (`hardware.GuideConfig`).
@@ -25,13 +22,7 @@ _NORMAL = 1.4826  # standard deviation of a normal distribution divided by its m
 
 @dataclasses.dataclass(frozen=True)
 class Preprocessing:
-    """The encoding of images, poses and scenario conditions for a model, and the test for a contact in tactile images.
-
-    A scenario condition has the known quantities of a trajectory, such as the acceleration of the pad.
-
-    Raises:
-        ValueError: A field has a value that is not allowed. The message names the field.
-    """
+    """The encoding of images, poses and conditions for a model, and its contact test, as `config.json` stores it."""
 
     resolution: tuple[int, int] = (64, 64)  # height and width of the images (pixels)
     crop: bool = False  # True: images show the square around the object. False: images show the whole pad
@@ -70,11 +61,11 @@ class Preprocessing:
         """Encode poses for the networks.
 
         Args:
-            pose: Position (m) and quaternion (w, x, y, z) of each pose. This method normalises the quaternions.
+            pose: Positions (m) and quaternions (w, x, y, z), which are normalised.
 
         Returns:
-            Position divided by `position_scale`, followed by the nine entries of the rotation matrix row by row. If
-            `rotation` is `quaternion`, the position is followed by the unit quaternion (w, x, y, z) with `w >= 0`.
+            Position divided by `position_scale`, then the nine entries of the rotation matrix row by row, or the unit
+            quaternion with `w >= 0` if `rotation` is `quaternion`.
         """
         position, quat = pose[..., :3] / self.position_scale, geometry.quat_canonical(pose[..., 3:])
         if self.rotation == "matrix":
@@ -82,15 +73,10 @@ class Preprocessing:
         return jnp.concatenate([position, quat], axis=-1)
 
     def decode_pose(self, code: Float[Array, "*n code"]) -> Float[Array, "*n 7"]:
-        """Decode poses from the output of a network.
+        """Decode poses from the output of a network: the inverse of `encode_pose`.
 
-        Args:
-            code: Encoded poses, as from `encode_pose`. The field `rotation` of this `Preprocessing` states whether the
-                poses contain rotation matrices or quaternions. An inexact rotation matrix is replaced by the nearest
-                rotation matrix. A quaternion is normalised. If all numbers of the rotation are 0, the identity is used.
-
-        Returns:
-            Position (m) and unit quaternion (w, x, y, z) with `w >= 0` of each pose.
+        An inexact rotation matrix is replaced by the nearest rotation matrix. A quaternion is normalised, with
+        `w >= 0`. If all numbers of the rotation are 0, the identity is used.
         """
         quat = code[..., 3:]
         if self.rotation == "matrix":
@@ -102,44 +88,18 @@ class Preprocessing:
         return jnp.concatenate([code[..., :3] * self.position_scale, quat], axis=-1)
 
     def encode_condition(self, condition: Float[Array, "*n c"]) -> Float[Array, "*n c"]:
-        """Encode conditions for the networks.
-
-        Args:
-            condition: Known quantities of the scenario such as an acceleration, c numbers for each item (SI units).
-
-        Returns:
-            The numbers, each divided by its typical size in the field `condition_scale`.
-        """
+        """Divide conditions (SI units) by their typical sizes `condition_scale`."""
         return condition / jnp.array(self.condition_scale, jnp.float32)
 
     def encode(self, name: str, values: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Encode the values of a modality for the networks.
-
-        Args:
-            name: Name of the modality.
-            values: Poses, images in [0, 1], or the values of a further modality (SI units). A further modality is
-                defined by a `dataset.Measurement`.
-
-        Returns:
-            The result of `encode_pose` for the modality `pose`. The numbers of a further modality are divided by its
-            scale in the field `scales`. Images are returned unchanged.
-        """
+        """Encode poses, images in [0, 1] or the values of a measurement (SI units). Images are returned unchanged."""
         if name == "pose":
             return self.encode_pose(values)
         scale = dict(self.scales).get(name)
         return values if scale is None else values / scale
 
     def decode(self, name: str, code: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Decode the output of an `mvae` network for a modality.
-
-        Args:
-            name: Name of the modality.
-            code: Output of the network (logits for images).
-
-        Returns:
-            Poses from `decode_pose` for the modality `pose`, numbers in SI units for a measurement
-            (`dataset.Measurement`) that is a vector, and images in [0, 1] for all other modalities.
-        """
+        """Decode the output of an `mvae` network: the inverse of `encode`, where images are logits."""
         if name == "pose":
             return self.decode_pose(code)
         scale = dict(self.scales).get(name)
@@ -148,16 +108,14 @@ class Preprocessing:
     def touched(self, tactile: Float[Array, "*n h w 3"], blank: Float[Array, "h w 3"]) -> Bool[Array, "*n"]:
         """Find the tactile images that show a contact.
 
+        The change of a block of `touch_block` x `touch_block` pixels is its mean colour minus that of the same block in
+        the blank image, and minus the median change of all blocks if `touch_level` is True. An image shows a contact if
+        the change of at least `touch_blocks` blocks exceeds `touch_threshold` in any channel. If `mask_blank_touch` is
+        False, the result is True for all images.
+
         Args:
             tactile: Tactile images in [0, 1].
             blank: Tactile image of the empty sensor in [0, 1].
-
-        Returns:
-            True for images in which at least `touch_blocks` blocks differ from the blank image. A block is a square
-            with a side of `touch_block` pixels. The change of a block is its mean colour minus the mean colour of the
-            same block in the blank image. If `touch_level` is True, the median change of all blocks of the image is
-            subtracted from each change, separately for each channel. A block differs if the magnitude of its change
-            exceeds `touch_threshold` in any channel. If `mask_blank_touch` is False, the result is True for all images.
         """
         if not self.mask_blank_touch:
             return jnp.ones(tactile.shape[:-3], bool)
@@ -167,39 +125,34 @@ class Preprocessing:
         differs = jnp.any(jnp.abs(change) > self.touch_threshold, axis=-1)
         return jnp.sum(differs, axis=(-2, -1)) >= self.touch_blocks
 
+    @classmethod
+    def from_json(cls, content: dict[str, Any]) -> "Preprocessing":
+        """Make a preprocessing from the result of `dataclasses.asdict`, or from the same values of a JSON file."""
+        if "resolution" not in content:  # it has a default value, but every model stores it
+            raise ValueError(f"field preprocessing.resolution is missing, got {content!r}")
+        return storage.decode(cls, content, "preprocessing")
 
+
+@checked
 def touch_of_noisy_images(
     preprocessing: Preprocessing, tactile: UInt8[np.ndarray, "n h w 3"], blank: UInt8[np.ndarray, "h w 3"]
 ) -> Preprocessing:
     """Adapt the contact test `Preprocessing.touched` to the noise of a camera's images.
 
-    In the adapted test, an image shows a contact if at least three blocks of 2 x 2 pixels differ from the blank image
-    by more than a threshold. The threshold is six times the standard deviation of the noise in the mean of a block, but
-    at least 3/255 and at most 24/255.
-
-    The estimate of the standard deviation uses the differences between the block means of the images and of the blank
-    image. The median is subtracted from the differences of each channel of an image, so a uniform change of the light
-    has no effect. The estimate is 1.4826 times the median magnitude of the differences after this subtraction. Contacts
-    on less than half of the pad hardly change the estimate. If the light has changed unevenly since the blank image
-    was taken, the estimate is larger.
+    An image then shows a contact if at least three blocks of 2 x 2 pixels change by more than six standard deviations
+    of the noise in the mean of a block, but at least 3/255 and at most 24/255. The standard deviation is 1.4826 times
+    the median magnitude of the changes, after the median of each channel of an image is subtracted. A uniform change
+    of the light has therefore no effect, and contacts on less than half of the pad have little.
 
     Args:
-        preprocessing: Preprocessing whose fields are kept, except the four fields of the contact test.
+        preprocessing: Preprocessing whose other fields are kept.
         tactile: Images of the empty pad, or of contacts on less than half of the pad.
         blank: Tactile image of the empty sensor, a mean over many frames.
-
-    Returns:
-        The preprocessing with new values of `touch_threshold`, `touch_block`, `touch_blocks` and `touch_level`.
-
-    Raises:
-        ValueError: `tactile` has no images, or the images have another resolution than the preprocessing.
     """
-    shape = (*preprocessing.resolution, 3)
-    if tactile.shape[1:] != shape or blank.shape != shape or not len(tactile):
+    if blank.shape[:2] != preprocessing.resolution or not len(tactile):
         raise ValueError(
-            f"tactile has shape {tactile.shape} and blank has shape {blank.shape}, but tactile must have shape (n, "
-            f"{', '.join(map(str, shape))}) with n >= 1, and blank must have shape {shape}: resize the images to "
-            "preprocessing.resolution"
+            f"there are {len(tactile)} images of {blank.shape[:2]} pixels, but at least one of "
+            f"preprocessing.resolution {preprocessing.resolution} is needed: resize the images"
         )
     change = _block_means(tactile.astype(np.float32) - blank, _NOISY_BLOCK)
     change = change - np.median(change, axis=(-3, -2), keepdims=True)
@@ -220,27 +173,3 @@ def _block_means(images: Any, side: int) -> Any:
         return images
     height, width = images.shape[-3] // side, images.shape[-2] // side
     return images.reshape(*images.shape[:-3], height, side, width, side, 3).mean((-4, -2))
-
-
-def preprocessing_from_json(content: dict) -> Preprocessing:
-    """Make a `Preprocessing` from the result of `dataclasses.asdict`, or from the same values read from a JSON file.
-
-    Args:
-        content: Values of the fields of a `Preprocessing` by name.
-
-    Returns:
-        The preprocessing.
-
-    Raises:
-        ValueError: The values do not describe a preprocessing.
-    """
-    try:
-        if "resolution" not in content:  # it has a default value, but every model stores it
-            raise ValueError("field preprocessing.resolution is missing")
-        return storage.decode(Preprocessing, content, "preprocessing")
-    except (TypeError, ValueError) as error:  # TypeError: a value that JSON does not have
-        raise ValueError(
-            f"the stored preprocessing is not valid ({type(error).__name__}: {error}): train the model with "
-            "training.train(..., preprocessing=dataclasses.asdict(p)), where p is a training.Preprocessing. The stored "
-            f"preprocessing is {content!r}"
-        ) from error

@@ -1,4 +1,4 @@
-"""Functions that make training arrays from trajectories, and the model configurations that fit these arrays."""
+"""Training arrays from trajectories, and the model configurations that fit these arrays."""
 
 import dataclasses
 import functools
@@ -7,15 +7,16 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, UInt8
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from sts_jax import mvae, optics, physics, statespace
+from sts_jax._checked import checked
 from sts_jax.dataset import Ends, Measurement, Pairs, Views, reduced_images
 from sts_jax.sensor import Sensor
 from sts_jax.training.arrays import Arrays
 from sts_jax.training.preprocess import Preprocessing
 
-SOME = 512  # number of items that are encoded at once
+_CHUNK = 512  # number of items that are encoded at once
 
 
 def frame_arrays(
@@ -29,41 +30,35 @@ def frame_arrays(
     """Make the training arrays of an `mvae` model: inputs from first frames, targets from last frames.
 
     Args:
-        pairs: First and last frames of trajectories, from `dataset.Dataset.pairs`.
+        pairs: From `dataset.Dataset.pairs`.
         modalities: Modalities of the model, some of `visual`, `tactile` and `pose`.
-        preprocessing: Preprocessing that encodes poses and conditions, and detects contacts in tactile images. If the
-            first tactile image of a trajectory shows no contact, the trajectory gives a sample without the input
-            `tactile`.
+        preprocessing: Encodes poses and conditions, and detects contacts in tactile images. A trajectory without a
+            contact in its first frame gives a sample without the input `tactile`.
         blank: Tactile image of the empty sensor, uint8 `(height, width, 3)`, from `dataset.empty_frame`.
         measurements: Further modalities of the model. `pairs.measurements` must have their values.
 
     Returns:
-        The arrays, and the preprocessing with new values of `absent` and `scales`. `absent` lists the modalities that
-        no sample has as an input, and `arrays.inputs` omits them. If no first frame shows a contact, `tactile` is in
-        `absent`. A further modality is in `absent` if it was measured in no first frame. `scales` contains the scale of
-        each further modality that is a vector.
-
-    Raises:
-        ValueError: `pairs.measurements` lacks a further modality.
+        The arrays, and the preprocessing with new values of `absent` (the modalities that no first frame has, which
+        `arrays.inputs` omits) and `scales` (of the measurements that are vectors).
     """
-    lacking = [own.name for own in measurements if own.name not in pairs.measurements]
+    further = tuple(measurement.name for measurement in measurements)
+    lacking = sorted(set(further) - set(pairs.measurements))
     if lacking:
         raise ValueError(
-            f"pairs.measurements lacks {', '.join(lacking)}: pass to Dataset.pairs the same argument `measurements` "
-            "that you pass here"
+            f"pairs.measurements lacks {', '.join(lacking)}: pass the same `measurements` to Dataset.pairs"
         )
-    scales = tuple((own.name, float(own.scale)) for own in measurements if not own.is_image)
+    scales = tuple((m.name, float(m.scale)) for m in measurements if not m.is_image)
     preprocessing = dataclasses.replace(preprocessing, scales=scales)
     code = np.asarray(_pose_codes(preprocessing, pairs.pose))
-    found = {"visual": pairs.visual, "tactile": pairs.tactile, "pose": code}
-    for own in measurements:
-        values = pairs.measurements[own.name]
-        found[own.name] = values if own.is_image else np.asarray(preprocessing.encode(own.name, jnp.asarray(values)))
+    frames = {"visual": pairs.visual, "tactile": pairs.tactile, "pose": code}
+    for m in measurements:
+        values = pairs.measurements[m.name]
+        frames[m.name] = values if m.is_image else np.asarray(preprocessing.encode(m.name, jnp.asarray(values)))
     condition = np.asarray(preprocessing.encode_condition(jnp.asarray(pairs.condition)))
-    further = tuple(own.name for own in measurements)
-    return _arrays(found, modalities, preprocessing, blank, condition if condition.shape[1] else None, further)
+    return _arrays(frames, modalities, preprocessing, blank, condition if condition.shape[1] else None, further)
 
 
+@checked
 def image_arrays(
     visual: UInt8[np.ndarray, "n 2 h w 3"],
     tactile: UInt8[np.ndarray, "n 2 h w 3"],
@@ -77,37 +72,24 @@ def image_arrays(
         visual: First and last visual image of each trajectory, for example from `hardware.recorded_images`.
         tactile: First and last tactile image of each trajectory.
         modalities: Modalities of the model, one or both of `visual` and `tactile`.
-        preprocessing: Preprocessing that detects contacts in tactile images. For images of a real camera, use the
-            result of `touch_of_noisy_images`. If the first tactile image of a trajectory shows no contact, the
-            trajectory gives a sample without the input `tactile`.
+        preprocessing: Detects contacts in tactile images. For images of a camera, from `touch_of_noisy_images`.
         blank: Tactile image of the empty sensor.
 
     Returns:
-        The arrays, and the preprocessing with a new value of `absent`. This field names the modalities that are
-        missing from the inputs of every sample. If `tactile` is a modality and no first image shows a contact, `absent`
-        is `("tactile",)`, and the arrays have no input `tactile`. Otherwise `absent` is empty.
-
-    Raises:
-        ValueError: `modalities` is empty or has a name other than `visual` and `tactile`, or the images are not uint8
-            with the resolution `preprocessing.resolution`.
+        The arrays, and the preprocessing with a new value of `absent`, as from `frame_arrays`.
     """
-    found, shape = {"visual": visual, "tactile": tactile}, (2, *preprocessing.resolution, 3)
-    if not modalities or not set(modalities) <= set(found):
+    if not modalities or not set(modalities) <= {"visual", "tactile"}:
+        raise ValueError(f"modalities must be one or both of 'visual' and 'tactile', got {modalities}")
+    if blank.shape[:2] != preprocessing.resolution:
         raise ValueError(
-            "modalities must contain at least one of the names 'visual' and 'tactile', and no other name, got "
-            f"{modalities}"
+            f"the images have {blank.shape[:2]} pixels, but preprocessing.resolution is {preprocessing.resolution}: "
+            "resize the images"
         )
-    for name, images in found.items():
-        if images.dtype != np.uint8 or images.shape != (len(visual), *shape) or not len(images):
-            raise ValueError(
-                f"{name} is {images.dtype} of shape {images.shape}, but visual and tactile must be uint8 of shape (n, "
-                f"{', '.join(map(str, shape))}) with the same n >= 1: convert and resize the images to this shape"
-            )
-    return _arrays(found, modalities, preprocessing, blank, None)
+    return _arrays({"visual": visual, "tactile": tactile}, modalities, preprocessing, blank, None)
 
 
 def _arrays(
-    found: dict[str, np.ndarray],
+    frames: dict[str, np.ndarray],
     modalities: tuple[str, ...],
     preprocessing: Preprocessing,
     blank: np.ndarray,
@@ -116,17 +98,17 @@ def _arrays(
 ) -> tuple[Arrays, Preprocessing]:
     """Make the training arrays of an `mvae` model from encoded first and last frames by modality."""
     # NaN marks frames in which a further modality was not measured.
-    known = {name: ~np.isnan(found[name]).reshape(*found[name].shape[:2], -1).any(-1) for name in further}
-    present = {name: mask[:, 0] for name, mask in known.items() if not mask[:, 0].all()}
+    measured = {name: ~np.isnan(frames[name]).reshape(*frames[name].shape[:2], -1).any(-1) for name in further}
+    present = {name: mask[:, 0] for name, mask in measured.items() if not mask[:, 0].all()}
     if "tactile" in modalities:
-        present["tactile"] = _touched(found["tactile"], preprocessing, blank)
+        present["tactile"] = _touched(frames["tactile"], preprocessing, blank)
     absent = tuple(name for name, mask in present.items() if not mask.any())
     names = (*modalities, *further)
     arrays = Arrays(
-        inputs={name: np.ascontiguousarray(found[name][:, 0]) for name in names if name not in absent},
-        targets={name: np.ascontiguousarray(found[name][:, 1]) for name in names},
+        inputs={name: np.ascontiguousarray(frames[name][:, 0]) for name in names if name not in absent},
+        targets={name: np.ascontiguousarray(frames[name][:, 1]) for name in names},
         present={name: mask for name, mask in present.items() if name not in absent},
-        target_present={name: mask[:, 1] for name, mask in known.items() if not mask[:, 1].all()},
+        target_present={name: mask[:, 1] for name, mask in measured.items() if not mask[:, 1].all()},
         condition=condition,
     )
     return arrays, dataclasses.replace(preprocessing, absent=absent)
@@ -137,35 +119,28 @@ def paper_model(
 ) -> mvae.Config:
     """Make the configuration of the networks in the See-Through-your-Skin paper.
 
-    In the loss, the weight of the reconstruction error is 1 for images and 1000 for the pose. A further modality has
-    the weight `Measurement.weight`.
+    The weight of the reconstruction error is 1 for images, 1000 for the pose, and `Measurement.weight` otherwise.
 
     Args:
         modalities: Modalities of the model, some of `visual`, `tactile` and `pose`.
         preprocessing: Preprocessing of the training arrays.
         measurements: Further modalities of the model.
-
-    Returns:
-        The configuration of an `mvae` model.
-
-    Raises:
-        ValueError: `modalities` has a name other than `visual`, `tactile` and `pose`.
     """
     shape = (*preprocessing.resolution, 3)
-    known = {name: mvae.Modality(name, "image", shape, start=0.7) for name in ("visual", "tactile")}
-    known["pose"] = mvae.Modality("pose", "vector", (preprocessing.pose_size,), weight=1000.0)
-    for name in modalities:
-        if name not in known:
-            raise ValueError(
-                f"modalities contains {name!r}, but it may contain only {', '.join(map(repr, known))}: remove "
-                f"{name!r} from modalities, and pass it as a dataset.Measurement in the argument measurements"
-            )
-    kept = [known[name] for name in modalities]
-    kept += [
-        mvae.Modality(own.name, "image" if own.is_image else "vector", own.shape, weight=float(own.weight))
-        for own in measurements
+    standard = {name: mvae.Modality(name, "image", shape, start=0.7) for name in ("visual", "tactile")}
+    standard["pose"] = mvae.Modality("pose", "vector", (preprocessing.pose_size,), weight=1000.0)
+    if not set(modalities) <= set(standard):
+        raise ValueError(
+            f"modalities may contain only {', '.join(map(repr, standard))}, got {modalities}: pass further modalities "
+            "as measurements"
+        )
+    further = [
+        mvae.Modality(m.name, "image" if m.is_image else "vector", m.shape, weight=float(m.weight))
+        for m in measurements
     ]
-    return mvae.Config(tuple(kept), condition=len(preprocessing.condition_scale))
+    return mvae.Config(
+        tuple([standard[name] for name in modalities] + further), condition=len(preprocessing.condition_scale)
+    )
 
 
 def state_arrays(
@@ -181,27 +156,17 @@ def state_arrays(
     """Make the training arrays of a state-space model.
 
     Args:
-        pairs: First and last frames of trajectories, from `dataset.Dataset.pairs`. The images must have
-            `model.input_size` pixels on each side.
+        pairs: From `dataset.Dataset.pairs`, with images of `model.input_size` pixels on each side.
         model: Configuration of the model, from `state_model`.
         scenario: Scenario of the trajectories.
-        preprocessing: Preprocessing that encodes poses and conditions, and detects contacts in tactile images. A
-            condition consists of known quantities of the scenario, such as the acceleration of the pad.
-        empty: `visual` and `tactile` image of the empty sensor, from `dataset.empty_frame`, uint8 `(size, size, 3)`.
-            The size is `model.input_size`.
-        views: Rendered visual images of objects in initial poses, from `dataset.Dataset.views`. The motion of these
-            objects is not simulated. The images are used only if `visual` is an input of the model.
-        falls: First and last poses of further trajectories without images, from `dataset.Dataset.ends`.
-
-    Returns:
-        The arrays.
-
-    Raises:
-        ValueError: The outcome of a trajectory is not in `scenario.outcomes`, or the images cannot be reduced to
-            `model.image_size`.
+        preprocessing: Encodes poses and conditions, and detects contacts in tactile images.
+        empty: `visual` and `tactile` image of the empty sensor, uint8 `(input_size, input_size, 3)`, from
+            `dataset.empty_frame`.
+        views: From `dataset.Dataset.views`. They are used only if `visual` is an input of the model.
+        falls: Further trajectories without images, from `dataset.Dataset.ends`.
     """
     ends: list[Pairs | Ends] = [pairs] if falls is None else [pairs, falls]
-    outcome, *other_outcomes = (_outcome_index(own.outcome, scenario) for own in ends)
+    outcome, *other_outcomes = (_outcome_index(x.outcome, scenario) for x in ends)
     condition, *other_conditions = (np.asarray(preprocessing.encode_condition(jnp.asarray(x.condition))) for x in ends)
     code = np.asarray(_pose_codes(preprocessing, pairs.pose))
     last = reduced_images({"visual": pairs.visual[:, 1], "tactile": pairs.tactile[:, 1]}, model.image_size)
@@ -238,7 +203,7 @@ def state_arrays(
 
 def _outcome_index(outcome: np.ndarray, scenario: physics.Scenario) -> np.ndarray:
     """Convert the numbers of outcomes to indices into `scenario.outcomes`."""
-    numbers = np.array([int(known) for known in scenario.outcomes])
+    numbers = np.array([int(outcome) for outcome in scenario.outcomes])
     if not np.isin(outcome, numbers).all():
         raise ValueError(
             f"the trajectories have the outcomes {np.unique(outcome).tolist()}, but the scenario "
@@ -250,21 +215,18 @@ def _outcome_index(outcome: np.ndarray, scenario: physics.Scenario) -> np.ndarra
 def state_codes(
     preprocessing: Preprocessing, pose: np.ndarray, support: np.ndarray, mass: np.ndarray, com: np.ndarray
 ) -> np.ndarray:
-    """Encode the true pose, shape and mass of each of n objects as a state code, a vector for a state-space model.
+    """Encode the true states of n objects as state codes `(n, code)`.
 
     Args:
         preprocessing: Preprocessing of the model.
-        pose: Positions (m) and unit quaternions (w, x, y, z), `(n, 7)`.
-        support: Support functions of the convex hulls for the 128 unit vectors `objects.DIRECTIONS`, `(n, 128)` (m).
+        pose: Poses `(n, 7)`.
+        support: Support functions of the convex hulls for `objects.DIRECTIONS`, `(n, 128)` (m).
         mass: Masses, `(n,)` (kg).
         com: Centres of mass in the mesh frame, `(n, 3)` (m).
-
-    Returns:
-        State codes, `(n, code)`. `statespace.state.State` describes the parts of a code.
     """
     encode = jax.jit(statespace.encode)
     parts = []
-    size = min(SOME, len(pose))
+    size = min(_CHUNK, len(pose))
     for start in range(0, len(pose), max(size, 1)):  # bounds the memory
         # The last part is filled up with copies of the last object, because another size would compile anew.
         rows = np.minimum(np.arange(start, start + size), len(pose) - 1)
@@ -295,23 +257,17 @@ def state_model(
         sensor: Sensor of the images.
         scenario: Scenario of the trajectories.
         preprocessing: Preprocessing of the trajectories. Its images must be square and show the whole view.
-        empty: `visual` and `tactile` image of the empty sensor, from `dataset.empty_frame`, uint8 `(size, size, 3)`.
-            The size is the side length of the input images (pixels).
-        image_size: Side length of the predicted images (pixels). It must divide the side length of the input images.
+        empty: `visual` and `tactile` image of the empty sensor, uint8, from `dataset.empty_frame`.
+        image_size: Side of the predicted images (pixels). It must divide the side of the input images.
 
     Returns:
-        The configuration, and the preprocessing with a new value of `absent`. This field names the modalities that are
-        missing from the inputs of every sample. If no first frame shows a contact, `tactile` is not an input of the
-        model, and `absent` is `("tactile",)`. Otherwise `absent` is empty.
-
-    Raises:
-        ValueError: The images are not square or are cropped, or their side length is not a multiple of `image_size`.
+        The configuration, and the preprocessing with a new value of `absent`, as from `frame_arrays`.
     """
     height, width = preprocessing.resolution
     if height != width or preprocessing.crop:
         raise ValueError(
-            f"resolution is {preprocessing.resolution} and crop is {preprocessing.crop}, but a state-space model needs "
-            "square images of the whole view: give a preprocessing with resolution=(n, n) and crop=False"
+            "a state-space model needs a preprocessing with resolution=(n, n) and crop=False, got resolution="
+            f"{preprocessing.resolution} and crop={preprocessing.crop}"
         )
     absent = () if _touched(pairs.tactile, preprocessing, empty["tactile"]).any() else ("tactile",)
     model = statespace.Config(
@@ -344,3 +300,37 @@ def _contacts(
 ) -> Bool[Array, "n"]:
     """`Preprocessing.touched` for uint8 images, compiled as one program."""
     return preprocessing.touched(jnp.asarray(tactile, jnp.float32) / 255, jnp.asarray(blank, jnp.float32) / 255)
+
+
+@checked
+def shifted(
+    images: UInt8[np.ndarray, "n 2 h w 3"], empty: UInt8[np.ndarray, "h w 3"], shifts: Int[np.ndarray, "n 2"]
+) -> UInt8[np.ndarray, "n 2 h w 3"]:
+    """Shift the images of trajectories, as if the objects were at other places on a level pad.
+
+    The difference from the image of the empty pad is shifted, so that the light on the pad stays in place. The result
+    is exact for points on the pad under distant lights, except for the vignetting of visual images. For a point at the
+    height z above the pad, the shift is too large by the factor 1 + z / d, where d is the distance from the camera to
+    the pad. What the border of the image cuts off is missing after the shift, too.
+
+    Args:
+        images: First and last image of each of n trajectories, all visual or all tactile.
+        empty: Image of the empty pad, visual or tactile like `images`.
+        shifts: Rows and columns by which each trajectory is shifted (pixels), to larger indices if positive. Its visual
+            and its tactile images need the same shift.
+    """
+    size = images.shape[2:4]
+    if (np.abs(shifts) >= size).any():
+        raise ValueError(
+            f"`shifts` has shifts of up to {np.abs(shifts).max(0).tolist()} pixels, but they must be below {size}"
+        )
+    moved = np.empty_like(images)
+    for out, pair, shift in zip(moved, images, shifts, strict=True):
+        change = np.zeros(pair.shape, np.int16)
+        (to_rows, to_columns), (from_rows, from_columns) = (
+            tuple(slice(max(sign * s, 0), n + min(sign * s, 0)) for s, n in zip(shift, size, strict=True))
+            for sign in (1, -1)
+        )
+        change[:, to_rows, to_columns] = (pair.astype(np.int16) - empty)[:, from_rows, from_columns]
+        out[:] = np.clip(empty + change, 0, 255)
+    return moved

@@ -1,0 +1,363 @@
+"""The folder of a trained model.
+
+- `config.json`: the model, the options of the training and the preprocessing
+- `blank.npz`: the images of the empty sensor
+- `checkpoints/STEP/`: the current checkpoint, which Orbax writes in two parts, `weights` and `optimiser`. A compact
+  checkpoint is one small file with rounded weights instead
+- `calibration.json`: the calibration of the current checkpoint, for state-space models
+- `metrics.jsonl`: the training log, one record per line: a step, and the means of the loss terms since the last record
+- `manifest.json`: the SHA-256 of these files, the step of the current checkpoint, and the log's length at this step
+
+A new checkpoint is written first, then the manifest is replaced, then the older checkpoint is deleted. At any kill, all
+files that the manifest lists are therefore complete. A manifest of a new checkpoint does not list the calibration of
+the older one. Records of the log after the current checkpoint are not listed: a resumed training makes them again.
+
+A prediction reads only the weights, so that a model stays readable with another optimiser or version of optax.
+"""
+
+import contextlib
+import hashlib
+import io
+import json
+import logging
+import shutil
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import nnx
+from jaxtyping import Array, ArrayLike, Int, UInt8
+from orbax.checkpoint import v1 as ocp
+
+from sts_jax import statespace, storage
+from sts_jax._checked import checked
+
+CONFIG, BLANK, CALIBRATION, LOG = "config.json", "blank.npz", "calibration.json", "metrics.jsonl"
+WEIGHTS, OPTIMISER = "weights", "optimiser"  # the parts of a checkpoint
+COMPACT = "weights.npz"  # the only file of a compact checkpoint
+Record = dict[str, float]  # `step`, and the terms of the loss by name
+
+_LEVELS = 128  # root mean square of the weights of a channel, in steps of rounded weights
+_LARGEST = 2**15 - 1  # largest whole number of a rounded weight, which has 16 bits
+_STEP = ":step"  # suffix of the name of the array that has the steps of a kernel
+
+
+class TrainState(NamedTuple):
+    """The state of a training. Without the optimiser's state, it is what a prediction needs."""
+
+    params: nnx.State  # parameters
+    stats: nnx.State  # running batch statistics
+    optimiser: optax.OptState | None  # state of the optimiser, None if it is not written or read
+    step: Int[Array, ""]  # gradient steps done
+
+
+def manifest(folder: Path) -> storage.Manifest | None:
+    """Read the manifest of a model's folder. None before the first checkpoint."""
+    listed = storage.read_manifest(folder, _remedy(folder))
+    if listed is None and any((folder / "checkpoints").glob("[0-9]*")):
+        raise storage.DamagedFileError(f"{folder} has a checkpoint but no {storage.MANIFEST}: {_remedy(folder)}.")
+    return listed
+
+
+def verified(folder: Path) -> int | None:
+    """Compare all files of a model but the calibration with the manifest. Return the step of its checkpoint, if any."""
+    listed = manifest(folder)
+    step = None if listed is None else listed.facts["step"]
+    if listed is not None and step is not None:
+        there = [name for name in (CONFIG, BLANK) if (folder / name).exists()]
+        names = dict.fromkeys([*listed.files, *there, *_files(folder, step)])
+        storage.verify(folder, listed, _remedy(folder), [name for name in names if name != CALIBRATION])
+    return step
+
+
+def save(folder: Path, state: TrainState, *, compact: bool = False) -> None:
+    """Write a checkpoint, then delete older checkpoints. If it fails, the previous checkpoint stays the current one.
+
+    Args:
+        folder: Folder of the model.
+        state: State of the training.
+        compact: True writes all arrays to one small file with rounded weights. A weight w is stored as a 16-bit integer
+            q, with `w = q s`. Each output channel of a kernel has its own step `s = max(rms / 128, largest / 32767)`.
+            Vectors, such as biases, are unchanged.
+    """
+    before = manifest(folder)
+    if before is None:
+        before = storage.write_manifest(folder, {}, {"step": None})
+    step, kept = int(state.step), before.facts["step"]
+    path = folder / _place(step)
+    try:
+        _keep_only(folder, kept)  # deletes a checkpoint that an interrupted call may have left
+        try:
+            if compact:
+                path.mkdir(parents=True)
+                write_rounded(path / COMPACT, _plain(state))
+            else:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                with _quiet_orbax():
+                    parts = {part: leaves for part, leaves in _parts(state).items() if leaves}
+                    ocp.save_checkpointables(str(path.absolute()), parts)
+        except Exception as error:  # Orbax and TensorStore raise many types, with pages of traceback
+            left = "no earlier checkpoint exists" if kept is None else f"the checkpoint of step {kept} is kept"
+            raise OSError(
+                f"cannot write {path}: {_first_line(error)}. {storage.remedy(error)}, then start again ({left})."
+            ) from None
+        beside = [name for name in (CONFIG, BLANK) if (folder / name).exists()]
+        known = {name: before.files[name] for name in beside if name in before.files}
+        new = [name for name in beside if name not in known] + _files(folder, step)
+        facts: dict[str, Any] = {"step": step}
+        if log := _logged(folder, before, whole=True):
+            facts["log"] = {"bytes": len(log), "sha256": hashlib.sha256(log).hexdigest()}
+        storage.write_manifest(folder, known | storage.checksums(folder, new), facts)
+        kept = step
+        (folder / CALIBRATION).unlink(missing_ok=True)
+    finally:
+        _keep_only(folder, kept)
+
+
+def restore(folder: Path, like: TrainState) -> TrainState | None:
+    """Read the current checkpoint, after comparing all files with the manifest. None without a checkpoint.
+
+    Args:
+        folder: Folder of the model.
+        like: State with the structure, shapes and dtypes of the state to read. The leaves may be abstract arrays, and
+            the optimiser may be None.
+    """
+    step = verified(folder)
+    if step is None:
+        return None
+    path = folder / _place(step)
+    loaded: dict[str, Array] = {}
+    for part, wanted in _parts(like).items():
+        try:
+            if (path / COMPACT).exists():
+                stored = read_rounded(path / COMPACT)
+                _compare(stored, wanted)
+                loaded |= jax.device_put({name: stored[name] for name in wanted}, jax.devices()[0])
+            else:
+                loaded |= _read_orbax(path, part, wanted)
+        except Exception as error:  # Orbax, TensorStore and zipfile raise many types, some with pages of traceback
+            reason = f"({type(error).__name__}: {_first_line(error)})"
+            if part == OPTIMISER:
+                raise ValueError(
+                    f"{path} has no state of this optimiser {reason}: give the optimiser that the training began with, "
+                    "or train in another folder. A model that Predictor.save wrote has none; Predictor.load needs none."
+                ) from None
+            raise ValueError(
+                f"{path} cannot be read {reason}, although its checksums are right. It belongs to another model or to "
+                "a version of sts_jax with other networks: load it with that version, or delete it and train again."
+            ) from None
+    return jax.tree.unflatten(jax.tree.structure(like), [loaded[name] for name in _plain(like)])
+
+
+def records(folder: Path) -> list[Record]:
+    """Read the training log of a model up to the current checkpoint, after comparing it with the manifest."""
+    listed = manifest(folder)
+    return [] if listed is None else [json.loads(line) for line in _logged(folder, listed).splitlines()]
+
+
+def append(folder: Path, record: Record) -> None:
+    """Append a record to the training log."""
+    try:
+        with (folder / LOG).open("a") as file:
+            file.write(json.dumps(record) + "\n")
+    except OSError as error:
+        raise OSError(
+            f"cannot write {folder / LOG}: {error.strerror or error}. {storage.remedy(error)}, then start again (the "
+            "last checkpoint is kept)."
+        ) from error
+
+
+def resume_log(folder: Path) -> list[Record]:
+    """Remove the records after the current checkpoint from the training log, and return the others."""
+    kept = records(folder)
+    storage.write_bytes(folder / LOG, "".join(json.dumps(record) + "\n" for record in kept).encode())
+    return kept
+
+
+def _logged(folder: Path, listed: storage.Manifest, *, whole: bool = False) -> bytes:
+    """The log up to the checkpoint of a manifest, or the whole log, compared with the manifest."""
+    path, fact = folder / LOG, listed.facts.get("log", {"bytes": 0})
+    content = path.read_bytes() if path.exists() else b""
+    known = content[: fact["bytes"]]
+    if len(known) < fact["bytes"] or (known and hashlib.sha256(known).hexdigest() != fact["sha256"]):
+        raise storage.DamagedFileError(
+            f"{path} is not the log that {storage.MANIFEST} lists up to step {listed.facts['step']}. It was edited, "
+            f"exchanged or damaged: {_remedy(folder)}."
+        )
+    return content if whole else known
+
+
+@checked
+def save_blank(
+    folder: Path, visual: UInt8[Array | np.ndarray, "h w 3"], tactile: UInt8[Array | np.ndarray, "h w 3"]
+) -> None:
+    """Write the images of the empty sensor to the folder of a model. An existing file is not changed."""
+    path, listed = folder / BLANK, manifest(folder)
+    new = not path.exists()
+    if new:
+        storage.write_arrays(path, {"visual": np.asarray(visual), "tactile": np.asarray(tactile)})
+    if listed is not None and (new or BLANK not in listed.files):
+        storage.write_manifest(folder, {**listed.files, BLANK: storage.sha256(path)}, listed.facts)
+
+
+def load_blank(folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read the images of the empty sensor, visual and tactile, uint8 (height, width, 3), from the folder of a model."""
+    path, listed = folder / BLANK, manifest(folder)
+    if not path.exists():
+        raise FileNotFoundError(
+            f"{path} is missing: start the training again, or write the file with training.save_blank."
+        )
+    if listed is not None and listed.facts["step"] is not None:
+        storage.verify(folder, listed, _remedy(folder), [BLANK])
+    images = storage.read_arrays(path, "delete it and start the training again, which writes the file anew")
+    return images["visual"], images["tactile"]
+
+
+def save_calibration(
+    folder: Path, calibration: statespace.Calibration, inputs: tuple[str, ...], data: int | None = None
+) -> None:
+    """Write the calibration of a model's current checkpoint.
+
+    Args:
+        folder: Folder of the model.
+        calibration: From `statespace.fit_calibration`.
+        inputs: Inputs of the model, `Config.inputs`.
+        data: Checksum of the arrays to which it was fitted, `Arrays.checksum`. None if unknown.
+    """
+    listed = manifest(folder)
+    if listed is None:
+        raise FileNotFoundError(f"{folder} has no checkpoint to calibrate: train a model there first.")
+    files = {name: checksum for name, checksum in listed.files.items() if name != CALIBRATION}
+    if CALIBRATION in listed.files:  # a kill during the write must leave a valid folder
+        storage.write_manifest(folder, files, listed.facts)
+    subsets = {}
+    for number, row in enumerate(np.asarray(calibration).T.tolist()):
+        members = [name for i, name in enumerate(inputs) if number & 2**i]
+        subsets[" and ".join(members) or "no input"] = dict(zip(calibration._fields, row, strict=True))
+    storage.write_json(folder / CALIBRATION, {"data": data, "subsets": subsets})
+    storage.write_manifest(folder, files | storage.checksums(folder, [CALIBRATION]), listed.facts)
+
+
+def read_calibration(folder: Path) -> tuple[statespace.Calibration, int | None] | None:
+    """Read the calibration of a model, and the checksum of the arrays to which it was fitted, if any."""
+    remedy = "restore it from a copy, or calibrate again (training.calibrate, or run the experiment again)"
+    listed = manifest(folder)
+    if listed is None or CALIBRATION not in listed.files:
+        return None
+    storage.verify(folder, listed, remedy, [CALIBRATION])
+    content = storage.read_json(folder / CALIBRATION, remedy)
+    rows = [[row[name] for name in statespace.Calibration._fields] for row in content["subsets"].values()]
+    return statespace.Calibration(*jnp.asarray(rows, jnp.float32).T), content["data"]
+
+
+def write_rounded(path: Path, arrays: Mapping[str, ArrayLike]) -> None:
+    """Write arrays to a compressed file. float32 arrays with two or more axes are rounded, see `save`."""
+    stored = {}
+    for name, array in arrays.items():
+        stored[name] = values = np.asarray(array)
+        if values.dtype != np.float32 or values.ndim < 2:
+            continue
+        inputs = tuple(range(values.ndim - 1))
+        rms = np.sqrt(np.mean(np.square(values, dtype=np.float64), axis=inputs))
+        step = np.maximum(rms / _LEVELS, np.abs(values).max(axis=inputs) / _LARGEST).astype(np.float32)
+        number = np.rint(values / np.where(step == 0, 1, step)).astype(np.int32)
+        # High and low bytes are stored apart, because the high bytes have few values and then compress better.
+        stored[name] = np.stack([number >> 8, number & 255]).astype(np.uint8)
+        stored[name + _STEP] = step
+    np.savez_compressed(path, allow_pickle=False, **stored)
+
+
+def read_rounded(path: Path) -> dict[str, np.ndarray]:
+    """Read a file that `write_rounded` wrote."""
+    with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
+        stored = dict(file)
+    arrays = {name: values for name, values in stored.items() if not name.endswith(_STEP)}
+    for name in arrays:
+        if name + _STEP in stored:
+            high, low = arrays[name].view(np.int8)[0], arrays[name][1]
+            arrays[name] = (high * np.float32(256) + low) * stored[name + _STEP]
+    return arrays
+
+
+def _read_orbax(path: Path, part: str, wanted: dict[str, Any]) -> dict[str, Array]:
+    if not wanted and not (path / part).exists():
+        return {}  # an optimiser without arrays has no part of its own
+    device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    abstract = {name: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device) for name, x in wanted.items()}
+    context = ocp.Context()
+    context.pytree.loading.partial_load = True
+    with _quiet_orbax():
+        # Compare the shapes first. Orbax cuts or pads arrays of another shape, or prints thousands of lines.
+        stored = ocp.metadata(str(path.absolute()), part).metadata
+        _compare(stored, wanted)
+        if part == OPTIMISER and stored.keys() != wanted.keys():
+            extra = min(stored.keys() - wanted.keys())
+            raise ValueError(f"the checkpoint has the array {extra}, which the given optimiser's state lacks")
+        with context:
+            return ocp.load(str(path.absolute()), abstract, checkpointable_name=part)
+
+
+def _compare(stored: Mapping[str, Any], wanted: dict[str, Any]) -> None:
+    for name, x in wanted.items():
+        if name not in stored or (stored[name].shape, stored[name].dtype) != (x.shape, x.dtype):
+            raise ValueError(f"array {name} is missing, or does not have shape {x.shape} and dtype {x.dtype}")
+
+
+def _place(step: int) -> str:
+    """Relative path of a checkpoint."""
+    return f"checkpoints/{step:08d}"
+
+
+def _files(folder: Path, step: int) -> list[str]:
+    """Relative paths of the files of a checkpoint."""
+    paths = sorted(path for path in (folder / _place(step)).rglob("*") if not path.is_dir())
+    return [path.relative_to(folder).as_posix() for path in paths]
+
+
+def _keep_only(folder: Path, step: int | None) -> None:
+    """Delete all checkpoints in a model's folder but that of one step. None deletes all. Other folders are kept."""
+    checkpoints = folder / "checkpoints"
+    for path in checkpoints.iterdir() if checkpoints.is_dir() else ():
+        is_checkpoint = path.name.split(".")[0].isdecimal()  # Orbax adds a suffix to that of an unfinished one
+        if is_checkpoint and (step is None or path != folder / _place(step)):
+            shutil.rmtree(path, ignore_errors=True)  # a folder that remains is ignored: the manifest does not name it
+
+
+@contextlib.contextmanager
+def _quiet_orbax() -> Iterator[None]:
+    """Silence the log in which Orbax prints the tracebacks of its threads, for example 237 lines if the disk is full.
+
+    Orbax also raises the error. A thread that fails after the error was raised still logs its traceback.
+    """
+    logger = logging.getLogger("absl")
+    disabled, logger.disabled = logger.disabled, True
+    try:
+        yield
+    finally:
+        logger.disabled = disabled
+
+
+def _plain(state: TrainState) -> dict[str, Any]:
+    """The arrays of a state by their paths, so that the files do not depend on the classes of Flax and optax."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(state)
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
+
+
+def _parts(state: TrainState) -> dict[str, dict[str, Any]]:
+    """The arrays of a state by part of the checkpoint, then by path."""
+    leaves = _plain(state)
+    optimiser = {name: leaf for name, leaf in leaves.items() if name.startswith(f"{OPTIMISER}/")}
+    weights = {name: leaf for name, leaf in leaves.items() if name not in optimiser}
+    return {WEIGHTS: weights} if state.optimiser is None else {WEIGHTS: weights, OPTIMISER: optimiser}
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:500]
+
+
+def _remedy(folder: Path) -> str:
+    return f"restore it from a copy, or delete {folder} and train again"
