@@ -1,4 +1,4 @@
-"""Display and storage of results: `show` draws a figure, `save` writes a file, and `load` reads it."""
+"""`show` draws a figure of a result, `save` writes a result to a file, and `load` reads it."""
 
 import io
 import os
@@ -35,23 +35,13 @@ class NotebookFigure(Figure):
 
 
 def show(thing: Frame | Body | Prediction | ArrayLike, *, title: str = "") -> Figure:
-    """Draw a frame, a body, a prediction or an image.
-
-    A notebook displays the figure. Elsewhere call `figure.savefig(path)`.
+    """Draw a frame, a body, a prediction or an image. A notebook displays the figure; elsewhere call `figure.savefig`.
 
     Args:
-        thing: One item to draw. A `Frame` gives four panels: visual image, tactile image, depth (mm) and pressure
-            (kPa). A `Body` gives an outside view of the object on a pad. A `Prediction` gives its predicted images. An
-            array (height, width, 3) is drawn as an image, and must have floats in [0, 1] or the type uint8. Select item
-            i of a batch with `jax.tree.map(lambda x: x[i], frames)`.
-        title: Title of the figure. By default, the title of a `Body` is its description, and other items have no title.
-
-    Returns:
-        A Matplotlib figure.
-
-    Raises:
-        TypeError: `thing` is not a `Frame`, a `Body`, a `Prediction` or an array.
-        ValueError: `thing` is a batch, a prediction without images, or an image with an invalid shape, type or range.
+        thing: One item. A `Frame` gives its visual and tactile image, depth (mm) and pressure (kPa), a `Body` an
+            outside view on a pad, and a `Prediction` its images. An array (height, width, 3) of floats in [0, 1] or
+            uint8 is an image. Select item i of a batch with `jax.tree.map(lambda x: x[i], frames)`.
+        title: Title of the figure. By default, the description of a `Body`, and no title otherwise.
     """
     panels = _panels(thing)
     if isinstance(thing, Body):
@@ -78,7 +68,7 @@ class _Panel(NamedTuple):
 
 
 def _panels(thing: Frame | Body | Prediction | ArrayLike) -> list[_Panel]:
-    """Return the images of the figure of an item."""
+    """The images of the figure of an item."""
     if isinstance(thing, Frame):
         _check_single("Frame", thing.depth, 2)
         seen = np.where(np.asarray(thing.segmentation), 1e3 * np.asarray(thing.depth), np.nan)
@@ -98,10 +88,7 @@ def _panels(thing: Frame | Body | Prediction | ArrayLike) -> list[_Panel]:
         streams = {"visual": thing.visual, "tactile": thing.tactile}
         panels = [_Panel(f"predicted {name}", np.asarray(x)) for name, x in streams.items() if x is not None]
         if not panels:
-            raise ValueError(
-                "the prediction has no image, because its model predicts neither the visual nor the tactile image. "
-                "Print the prediction instead"
-            )
+            raise ValueError("the prediction has no image, because its model predicts none: print it instead")
         for panel in panels:
             _check_single("Prediction", panel.values, 3)
         return panels
@@ -109,34 +96,18 @@ def _panels(thing: Frame | Body | Prediction | ArrayLike) -> list[_Panel]:
 
 
 def save(path: str | os.PathLike[str], thing: Frame | Body | Trajectory | ArrayLike) -> None:
-    """Write a frame, body, trajectory or image to a file. An interruption leaves no incomplete file.
+    """Write a frame, body, trajectory or image to a file, atomically.
 
     Args:
-        path: Path of the file. Its suffix selects the format:
-            `.npz` stores all arrays of a `Frame`, a `Body` or a `Trajectory`, and `load` reads them.
-            `.png` stores an image, or the visual and the tactile image of a `Frame` side by side, with 8 bits per
-            channel.
-        thing: Item to write. An image is an array (height, width, 3) of floats in [0, 1] or uint8. A frame for a `.png`
-            file must be one frame and not a batch.
-
-    Raises:
-        TypeError: The format cannot store an item of this type.
-        ValueError: The path has a suffix other than `.npz` or `.png`. This error is also raised for an image with an
-            invalid shape, type or range, and for a batch of frames if the path ends in `.png`.
-        OSError: The file cannot be written.
+        path: A path that ends in `.npz` for all arrays of a `Frame`, a `Body` or a `Trajectory`, which `load` reads, or
+            in `.png` for an image, or for the visual and the tactile image of a `Frame` side by side.
+        thing: Item to write. An image is an array (height, width, 3) of floats in [0, 1] or uint8.
     """
     path = Path(path)
     if path.suffix.lower() == ".png":
         if isinstance(thing, Frame):
             _check_single("Frame", thing.depth, 2)
             image = np.concatenate([np.asarray(thing.visual), np.asarray(thing.tactile)], axis=1)
-        elif isinstance(thing, Body | Prediction | Trajectory):
-            remedies = ["save it as .npz"] * isinstance(thing, tuple(_KINDS.values()))
-            remedies += ["draw it with sts.show(...).savefig(path)"] * (not isinstance(thing, Trajectory))
-            raise TypeError(
-                f"`thing` is a {type(thing).__name__}, but only a Frame or an image can be written to a .png file: "
-                f"{', or '.join(remedies)}"
-            )
         else:
             image = _image(thing)
         data = io.BytesIO()
@@ -144,8 +115,8 @@ def save(path: str | os.PathLike[str], thing: Frame | Body | Trajectory | ArrayL
     elif path.suffix.lower() == ".npz":
         if not isinstance(thing, tuple(_KINDS.values())):
             raise TypeError(
-                f"`thing` has the type {type(thing).__name__}, but `save` can write only objects of the types "
-                f"{', '.join(_KINDS)} to an .npz file. Write an image to a .png file, and other arrays with np.savez"
+                f"`thing` is a {type(thing).__name__}, but only a {', '.join(_KINDS)} can be written to an .npz file: "
+                "write an image to a .png file, and other arrays with np.savez"
             )
         leaves, _ = jax.tree_util.tree_flatten_with_path(thing)
         arrays = {jax.tree_util.keystr(key, simple=True, separator="/"): np.asarray(leaf) for key, leaf in leaves}
@@ -153,32 +124,15 @@ def save(path: str | os.PathLike[str], thing: Frame | Body | Trajectory | ArrayL
         data = io.BytesIO()
         np.savez_compressed(data, allow_pickle=False, **arrays)
     else:
-        raise ValueError(
-            f"path is {str(path)!r}, but it must end in .npz (for a Frame, Body or Trajectory) or .png (for a Frame or "
-            "an image)"
-        )
+        raise ValueError(f"path must end in .npz (Frame, Body, Trajectory) or .png (Frame, image), got {str(path)!r}")
     write_bytes(path, data.getvalue())
 
 
 def load(path: str | os.PathLike[str]) -> Any:
-    """Read a frame, body or trajectory from an `.npz` file that `save` wrote.
-
-    Args:
-        path: Path of the file.
-
-    Returns:
-        The `Frame`, `Body` or `Trajectory`.
-
-    Raises:
-        FileNotFoundError: The file does not exist.
-        ValueError: The path is a folder, or its suffix is not `.npz`.
-        DamagedFileError: The file is damaged, or was written by another program or by another version of `save`.
-            DamagedFileError is an OSError.
-        OSError: The file cannot be read.
-    """
+    """Read the `Frame`, `Body` or `Trajectory` from an `.npz` file that `save` wrote."""
     path = Path(path)
     if not path.exists():
-        raise FileNotFoundError(f"{path}: no such file. Write one with sts.save")
+        raise FileNotFoundError(f"{path}: no such file")
     if path.is_dir() or path.suffix.lower() != ".npz":
         raise ValueError(f"path is {str(path)!r}, but it must be an .npz file that sts.save wrote")
     data = path.read_bytes()
@@ -213,8 +167,8 @@ def _check_single(name: str, array: Any, rank: int) -> None:
     """Raise a ValueError if an array of a single item, which has `rank` axes, has leading axes."""
     if np.ndim(array) != rank:
         raise ValueError(
-            f"the {name} has leading axes {np.shape(array)[: np.ndim(array) - rank]}, but a single item is needed. "
-            "Select the first item with jax.tree.map(lambda x: x[0], batch)"
+            f"the {name} has leading axes {np.shape(array)[: np.ndim(array) - rank]}, but a single item is needed: "
+            "select one with jax.tree.map(lambda x: x[0], batch)"
         )
 
 
@@ -222,8 +176,8 @@ def _image(thing: Any) -> np.ndarray:
     """Check that an argument is an RGB image, and return it as floats in [0, 1]."""
     if not isinstance(thing, np.ndarray | jax.Array):
         raise TypeError(
-            f"`thing` has the type {type(thing).__name__}, but it must be a Frame or an image, which is an array "
-            "(height, width, 3). In sts.show, it may also be a Body or a Prediction"
+            f"`thing` is a {type(thing).__name__}, but `show` draws a Frame, a Body, a Prediction or an image (height, "
+            "width, 3), and a .png file has a Frame or an image"
         )
     image = np.asarray(thing)
     if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
@@ -232,7 +186,6 @@ def _image(thing: Any) -> np.ndarray:
         return image / 255
     if image.dtype.kind != "f" or not (np.isfinite(image).all() and image.min() >= 0 and image.max() <= 1):
         raise ValueError(
-            f"the image has the type {image.dtype} and values in [{image.min()}, {image.max()}], but it must be uint8, "
-            "or floats in [0, 1]"
+            f"the image must be uint8 or floats in [0, 1], got {image.dtype} in [{image.min()}, {image.max()}]"
         )
     return image

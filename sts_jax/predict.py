@@ -2,34 +2,39 @@
 
 import dataclasses
 import importlib.resources
-import math
-import operator
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
-from jaxtyping import Array, ArrayLike, Bool, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Bool, Key, Num
 
-from sts_jax import _arguments, mvae, statespace, storage, training
+from sts_jax import mvae, statespace, storage, training
+from sts_jax._checked import checked
 from sts_jax.prediction import Prediction, completed, flagged, predict, predict_samples
 
 MODALITIES = ("visual", "tactile", "pose")
 MODELS = Path(str(importlib.resources.files("sts_jax"))) / "models"  # trained models of the library, one folder each
+_QUAT_TOLERANCE = 1e-2  # largest deviation of a quaternion's length from 1
+_FARTHEST = 10.0  # m, largest coordinate of a position. A larger number is probably in millimetres
 _LARGEST_CONDITION = 100.0  # largest condition, as a multiple of its usual magnitude
+
+Images = Num[Array | np.ndarray, "*n h w 3"]
+Poses = Num[Array | np.ndarray, "*n 7"]
+Numbers = Num[Array | np.ndarray, "*n c"]
+Kind = Literal["image", "pose", "vector"]  # each kind of inputs has its own range
 
 
 class Predictor:
     """A trained model as a function: `predictor(visual=image)` returns a `Prediction`.
 
-    The inputs are images and the object's pose in the first frame of a trajectory. A model can have further inputs
-    (`dataset.Measurement`). The prediction is the last frame, in which the object has come to rest.
-
-    `Predictor.load("freefall")` loads a model that comes with the library.
-    `Predictor.load("runs/freefall/models/statespace")` loads a model that you trained. Calls are pure, and work inside
-    `jax.jit`, `jax.vmap` and `jax.grad`. On a CPU, predict large batches in one thread only. With JAX 0.10.1, two
-    simultaneous calls, each with a batch of 60 images, never returned.
+    The prediction is the last frame, in which the object has come to rest. `Predictor.load("freefall")` loads a model
+    that comes with the library, and `Predictor.load("runs/freefall/models/statespace")` one that you trained. Calls are
+    pure, and work inside `jax.jit`, `jax.vmap` and `jax.grad`. On a CPU, predict large batches in one thread only. With
+    JAX 0.10.1, two simultaneous calls, each with a batch of 60 images, never returned.
     """
 
     def __init__(
@@ -42,106 +47,92 @@ class Predictor:
         """Create a predictor from its parts. `Predictor.load` is the usual way.
 
         Args:
-            model: Trained model: definition, parameters and running statistics.
+            model: Trained model.
             preprocessing: Preprocessing with which the model was trained.
-            blank: Visual and tactile image of the untouched sensor, each uint8 (height, width, 3).
+            blank: Visual and tactile image of the empty sensor, each uint8 (height, width, 3).
             name: Name or folder of the model, for error messages.
         """
-        if isinstance(model.config, mvae.Config):  # a vector without a scale was trained on its own numbers
-            vectors = [own.name for own in model.config.modalities if own.kind == "vector" and own.name != "pose"]
-            scales = tuple((name, dict(preprocessing.scales).get(name, 1.0)) for name in vectors)
-            preprocessing = dataclasses.replace(preprocessing, scales=scales)
-        self.model = model
-        self.preprocessing = preprocessing
-        self.name = name
-        self._images = blank
-        images = (jnp.asarray(image.astype(np.float32) / 255) for image in blank)
-        self._empty = dict(zip(("visual", "tactile"), images, strict=True))
+        size = (*preprocessing.resolution, 3)
+        # Kind of each input, and shape of one item
+        self._kinds: dict[str, Kind] = {"visual": "image", "tactile": "image", "pose": "pose"}
+        self._shapes: dict[str, tuple[int, ...]] = {"visual": size, "tactile": size, "pose": (7,)}
         config = model.config
         self._inputs = config.names if isinstance(config, mvae.Config) else config.inputs
         self._names = config.names if isinstance(config, mvae.Config) else MODALITIES
-        size = (*preprocessing.resolution, 3)
-        # kind of each input, and shape of one item
-        self._kinds: dict[str, _arguments.Kind] = {"visual": "image", "tactile": "image", "pose": "pose"}
-        self._shapes: dict[str, tuple[int, ...]] = {"visual": size, "tactile": size, "pose": (7,)}
         if isinstance(config, mvae.Config):
             for modality in config.modalities:
                 self._kinds.setdefault(modality.name, modality.kind)
                 self._shapes.setdefault(modality.name, modality.shape)
+            # A vector without a scale was trained on its own numbers.
+            vectors = [name for name, kind in self._kinds.items() if kind == "vector"]
+            scales = tuple((name, dict(preprocessing.scales).get(name, 1.0)) for name in vectors)
+            preprocessing = dataclasses.replace(preprocessing, scales=scales)
+        else:
+            self._kinds["state"], self._shapes["state"] = "vector", (statespace.STATE_CODE,)
+        self.model = model
+        self.preprocessing = preprocessing
+        self.name = name
+        self._blank = blank
+        images = (jnp.asarray(image.astype(np.float32) / 255) for image in blank)
+        self._empty = dict(zip(("visual", "tactile"), images, strict=True))
 
     @classmethod
     def load(
-        cls,
-        folder: str | Path,
-        *,
-        resolution: tuple[int, int] | None = None,
-        crop: bool | None = None,
+        cls, folder: str | Path, *, resolution: tuple[int, int] | None = None, crop: bool | None = None
     ) -> "Predictor":
-        """Load a trained model.
+        """Load a trained model, after comparing its files with their checksums.
 
         Args:
-            folder: Folder of a trained model, such as `runs/freefall/models/mvae`, or the name of a model that comes
-                with the library, such as `freefall`. The folder must be the `workdir` of a training or a folder that
-                `save` wrote. If a name is given, and the current directory has a folder of this name that contains
-                `config.json`, the model in this folder is loaded.
+            folder: Folder of a model, the `workdir` of a training or a folder that `save` wrote, or the name of a model
+                that comes with the library, such as `freefall`. A folder of this name in the current directory that
+                contains `config.json` comes first.
             resolution: Height and width of the images that you will pass (pixels). If given, a model that was trained
                 at another resolution raises an error.
             crop: View of the images that you will pass: True for the square around the object, False for the whole pad.
                 If given, a model that was trained on the other view raises an error.
-
-        Returns:
-            The predictor.
-
-        Raises:
-            FileNotFoundError: The folder contains no model, and the library has no model of this name.
-            OSError: A file is damaged, missing or not listed in `manifest.json`.
-            ValueError: The model was trained at another resolution or on another view, was written by another version
-                of sts_jax, or has no manifest.
         """
         path = _located(folder)
         model = training.load(path)
         try:
             preprocessing = training.Preprocessing.from_json(model.settings["preprocessing"])
         except ValueError as error:
-            raise ValueError(f"the field 'preprocessing' of {path / 'config.json'} is not valid: {error}") from error
-        for field, asked in (("resolution", resolution and tuple(resolution)), ("crop", crop)):
-            there = getattr(preprocessing, field)
-            if asked is not None and asked != there:
-                raise ValueError(
-                    f"the model {folder} was trained with {field}={there}, but {field}={asked} was requested: "
-                    f"render images with {field}={there}, or train a model with {field}={asked}."
-                )
+            raise ValueError(
+                f"the field 'preprocessing' of {path / 'config.json'} is not valid: {error}. Train the model with "
+                "training.train(..., preprocessing=dataclasses.asdict(p)), where p is a training.Preprocessing."
+            ) from error
+        needed: dict[str, Any] = {"resolution": resolution and tuple(resolution), "crop": crop}
+        _compare(str(folder), preprocessing, {name: value for name, value in needed.items() if value is not None})
         if isinstance(model.config, statespace.Config):
-            _check_view(str(folder), model.config, preprocessing)
+            size = (model.config.input_size,) * 2
+            scale = model.config.position_scale
+            _compare(
+                f"the networks of {folder}",
+                preprocessing,
+                {"resolution": size, "crop": False, "rotation": "matrix", "position_scale": scale},
+            )
         blank = training.load_blank(path)
         if any(image.shape[:2] != preprocessing.resolution for image in blank):
             raise ValueError(
                 f"{path / 'blank.npz'} has images of {blank[0].shape[:2]} pixels, but the model needs "
-                f"{preprocessing.resolution}: the file is from another model. Delete the folder {path} and train again."
+                f"{preprocessing.resolution}: write it with training.save_blank, and train again."
             )
         return cls(model, preprocessing, blank, str(folder))
 
     def save(self, folder: str | Path, *, compact: bool = False) -> None:
-        """Write the model to a folder that `load` reads.
-
-        Training cannot resume from this folder, because the folder does not contain the state of the optimiser.
+        """Write the model to a folder that `load` reads. It has no optimiser's state, so training cannot resume there.
 
         Args:
             folder: New or empty folder.
             compact: If True, round the weights, which reduces their size on disk to a third. Each weight of an
                 output channel changes by at most r / 256, where r is the root mean square of the channel's weights.
                 Predictions change slightly.
-
-        Raises:
-            FileExistsError: The folder is not empty, or is a file.
-            OSError: The disk is full, or the folder is not writable.
         """
         folder = Path(folder)
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise FileExistsError(f"{folder} is not an empty folder: give a new or an empty folder.")
         settings = {**self.model.settings, "preprocessing": dataclasses.asdict(self.preprocessing)}
         params, stats = nnx.split_state(self.model.state, nnx.Param, nnx.BatchStat)
-        training.save_blank(folder, *self._images)
+        training.save_blank(folder, *self._blank)
         storage.write_json(folder / "config.json", settings)
         training.save(folder, training.TrainState(params, stats, None, jnp.int32(self.model.step)), compact=compact)
         if self.model.calibration is not None:
@@ -155,186 +146,142 @@ class Predictor:
             f"steps={self.model.step})"
         )
 
+    @checked
     def __call__(
         self,
         *,
-        visual: ArrayLike | None = None,
-        tactile: ArrayLike | None = None,
-        pose: ArrayLike | None = None,
-        condition: ArrayLike | None = None,
-        state: ArrayLike | None = None,
-        measurements: dict[str, ArrayLike] | None = None,
-        present: dict[str, ArrayLike] | None = None,
-        key: PRNGKeyArray | None = None,
+        visual: Images | None = None,
+        tactile: Images | None = None,
+        pose: Poses | None = None,
+        condition: Numbers | None = None,
+        state: Num[Array | np.ndarray, "*n code"] | None = None,
+        measurements: Mapping[str, ArrayLike | None] | None = None,
+        present: Mapping[str, ArrayLike] | None = None,
+        key: Key[Array, ""] | None = None,
         num_samples: int = 0,
     ) -> Prediction:
         """Predict the last frame of trajectories from their first frames.
 
-        Pass at least one of `visual`, `tactile`, `pose` and `measurements`. All arrays are floating-point and have the
-        same leading axes *n: none for a single item, and any number for a batch.
-
-        Outside `jax.jit`, an invalid value raises an error. Traced values cannot raise errors: an item with an invalid
-        traced value gives a prediction of NaN. Other items of the batch are not affected.
+        Pass at least one input. All arrays have the same leading axes *n: none for a single item, and any number for a
+        batch. Outside `jax.jit`, an invalid value raises an error. Traced values cannot raise errors: an item with an
+        invalid traced value gives a prediction of NaN. Other items of the batch are not affected.
 
         Args:
-            visual: Visual images in [0, 1], (*n, height, width, 3).
-            tactile: Tactile images in [0, 1], (*n, height, width, 3). Images without contact are ignored, unless the
-                model was trained with blank tactile images as inputs.
-            pose: Poses of the object, (*n, 7): position (m) and unit quaternion, mesh frame in the sensor frame.
-            condition: Known parameters of the trajectories in SI units, (*n, c), for models that were trained with
-                them. For the scenario `Perturbed`: acceleration of the pad along x and y (m/s^2), and its duration (s).
-            state: Codes of the true pose, shape and mass, (*n, code), from `statespace.encode`. Only for state-space
-                models. With the true state of a simulation, the remaining error is that of the learned physics and of
-                the decoder.
+            visual: Visual images in [0, 1].
+            tactile: Tactile images in [0, 1]. Images without contact are ignored, unless the model was trained with
+                blank tactile images as inputs.
+            pose: Poses of the object: position (m) and unit quaternion, mesh frame in the sensor frame.
+            condition: Conditions in SI units, for models that were trained with them. For `Perturbed`: acceleration of
+                the pad along x and y (m/s^2), and its duration (s).
+            state: State codes of the true states, from `statespace.encode`. Only for state-space models. The remaining
+                error is that of the learned physics and of the decoder.
             measurements: Values of further modalities (`dataset.Measurement`) by name: vectors in SI units, (*n, size),
                 or images in [0, 1], (*n, height, width, channels).
-            present: Dictionary from the name of a modality to a Boolean mask (*n,), False for items in which the
-                modality is to be ignored. Ignored values may be NaN. By default, all items are used.
+            present: Masks by the name of the input, False for items in which it is to be ignored. Ignored values may be
+                NaN. By default, all items are used.
             key: Random key that draws the samples. It is needed only if `num_samples` > 0.
             num_samples: Number of predictions to draw for each item, returned in `Prediction.samples`. If it is > 0,
                 the images of a state-space model's prediction are means over these samples.
-
-        Returns:
-            The prediction for each item.
-
-        Raises:
-            ValueError: No input is given, the model does not accept an input or was trained without it, or a value has
-                a wrong type or shape, is out of range, or is NaN. The message names the argument and the remedy.
         """
-        own = _arguments.checked_measurements(measurements, MODALITIES)
-        every = {"visual": visual, "tactile": tactile, "pose": pose, **own}
-        given = {name: value for name, value in every.items() if value is not None}
-        if not given:
-            raise ValueError(
-                f"nothing to predict from: give at least one of these arguments: {', '.join(self.modalities)}."
-            )
-        arrays = {name: self._checked_name(name, value) for name, value in given.items()}
-        leads = {name: array.shape[: array.ndim - len(self._shapes[name])] for name, array in arrays.items()}
+        every = {"visual": visual, "tactile": tactile, "pose": pose, "state": state, **(measurements or {})}
+        inputs = {name: self._input(name, value) for name, value in every.items() if value is not None}
+        if not inputs:
+            raise ValueError(f"nothing to predict from: give at least one of {', '.join(self.modalities)}.")
+        leads = {name: array.shape[: array.ndim - len(self._shapes[name])] for name, array in inputs.items()}
         lead = next(iter(leads.values()))
         if len(set(leads.values())) > 1:
             raise ValueError(f"the leading axes differ: {leads}. Pass arrays with the same leading axes.")
-        masks = _arguments.checked_masks(present, arrays, lead)
-        valid: Array | None = None  # mask of the valid items, (*n,), or None if no value is traced
-        for name, array in arrays.items():
-            mask = masks.get(name)
-            if _arguments.traced(array) or _arguments.traced(mask):
-                fine = _arguments.plausible(self._kinds[name], jnp.asarray(array))
-                fine = fine if mask is None else fine | ~mask
-                valid = fine if valid is None else valid & fine
-            else:
-                _arguments.check_values(name, self._kinds[name], np.asarray(array if mask is None else array[mask]))
-        if state is not None:
-            arrays["state"] = self._checked_state(state, lead)
-        condition, plausible = self._checked_condition(condition, lead)
-        if plausible is not None:
-            valid = plausible if valid is None else valid & plausible
-        num_samples = _arguments.checked_samples(num_samples, key)
-        result = self._predicted(arrays, masks, lead, condition, key if num_samples else None, num_samples)
-        return result if valid is None else flagged(result, valid)
+        if num_samples < 0 or (num_samples and key is None):
+            raise ValueError(f"num_samples={num_samples} and key={key}: give num_samples >= 0, and a key if it is > 0.")
+        masks = {name: _array(mask) for name, mask in (present or {}).items()}
+        for name, mask in masks.items():
+            if name not in inputs or mask.shape != lead or mask.dtype != bool:
+                raise ValueError(
+                    f"present[{name!r}] is {mask.dtype} of shape {mask.shape}, but it must be bool of shape {lead} for "
+                    f"one of the given inputs {list(inputs)}."
+                )
+        valid = []  # masks of the items whose traced values are in range
+        for name, array in inputs.items():
+            fine, ignored = _in_range(self._kinds[name], array), ~masks[name] if name in masks else False
+            if _traced(fine) or _traced(ignored):
+                valid.append(fine | ignored)
+            elif not np.all(fine | ignored):
+                raise ValueError(_reason(name, self._kinds[name], np.asarray(array)[~(fine | ignored)]))
+        return self._predicted(inputs, masks, lead, condition, valid, key if num_samples else None, num_samples)
 
-    def prior(self, shape: tuple[int, ...] = (), *, condition: ArrayLike | None = None) -> Prediction:
+    @checked
+    def prior(self, shape: tuple[int, ...] = (), *, condition: Numbers | None = None) -> Prediction:
         """Predict the last frame of trajectories without any measurement, from the model's prior distribution.
 
         Args:
             shape: Sizes of the leading axes of the predictions. The default is a single prediction.
-            condition: Known parameters of each trajectory in SI units, (*shape, number of parameters), for models that
-                were trained with them. For the scenario `Perturbed`: acceleration of the pad along x and y (m/s^2),
-                and its duration (s).
-
-        Returns:
-            The predictions.
-
-        Raises:
-            ValueError: A size in `shape` is not a whole number > 0, or `condition` is missing, not accepted by the
-                model, or out of range.
+            condition: Conditions, (*shape, c), as in a call.
         """
-        try:
-            shape = tuple(operator.index(size) for size in shape)
-        except TypeError:
-            raise ValueError(f"shape is {shape!r}, but it must be a tuple of whole numbers, such as (3,).") from None
-        if min(shape, default=1) < 1:
-            raise ValueError(f"shape is {shape}, but each size must be >= 1.")
-        condition, plausible = self._checked_condition(condition, shape)
-        result = self._predicted({}, {}, shape, condition, None, 0)
-        return result if plausible is None else flagged(result, plausible)
+        return self._predicted({}, {}, shape, condition, [], None, 0)
 
     def _predicted(
         self,
         inputs: dict[str, Any],
         present: dict[str, Any],
         lead: tuple[int, ...],
-        condition: np.ndarray | Array | None,
-        key: PRNGKeyArray | None,
+        condition: Any,
+        valid: list[Array],
+        key: Array | None,
         num_samples: int,
     ) -> Prediction:
         model, view = self.model, self.preprocessing
+        condition, fine = self._condition(condition, lead)
+        graphdef, state = model.graphdef, model.state
         if isinstance(model.config, mvae.Config):
-            return predict(
-                model.graphdef,
-                model.state,
+            blank, shape = self._empty["tactile"], () if inputs else lead
+            result = predict(graphdef, state, view, blank, inputs, present, condition, key, num_samples, shape)
+        else:
+            inputs, present = completed(self._inputs, view.resolution, inputs, present, lead)
+            result = predict_samples(
+                graphdef,
+                state,
                 view,
-                self._empty["tactile"],
+                self._empty,
                 inputs,
                 present,
                 condition,
                 key,
                 num_samples,
-                () if inputs else lead,
+                lead,
+                model.calibration,
             )
-        inputs, present = completed(self._inputs, view.resolution, inputs, present, lead)
-        return predict_samples(
-            model.graphdef,
-            model.state,
-            view,
-            self._empty,
-            inputs,
-            present,
-            condition,
-            key,
-            num_samples,
-            lead,
-            model.calibration,
-        )
+        valid = valid if fine is None else [*valid, fine]
+        return flagged(result, jnp.all(jnp.stack(valid), axis=0)) if valid else result
 
     @property
     def modalities(self) -> tuple[str, ...]:
-        """Names of the inputs that the model accepts, such as "visual", "tactile" and "pose".
-
-        The names can include further modalities, each defined by a `dataset.Measurement`. The model accepts an input
-        only if the first frame of at least one training trajectory contains this input.
-        """
+        """Names of the inputs that the model accepts: those that the first frame of a training trajectory had."""
         return tuple(name for name in self._inputs if name not in self.preprocessing.absent)
 
     @property
     def outcomes(self) -> tuple[str, ...]:
-        """Names of the outcomes in the order of `Prediction.outcome_probability`, such as ("rests", "fell off").
-
-        Empty for `mvae` models, and for state-space models of older versions that did not store the names.
-        """
+        """Names of the outcomes in the order of `Prediction.outcome_probability`, empty for `mvae` models."""
         config = self.model.config
         return config.outcome_names if isinstance(config, statespace.Config) else ()
 
     @property
     def empty(self) -> dict[str, np.ndarray]:
-        """Images of the untouched sensor with the keys "visual" and "tactile": float32 (height, width, 3) in [0, 1]."""
+        """Images of the empty sensor, `visual` and `tactile`: float32 (height, width, 3) in [0, 1]."""
         return {name: np.asarray(image) for name, image in self._empty.items()}
 
-    def _checked_name(self, name: str, value: Any) -> np.ndarray | Array:
-        """Check the type and shape of the input `name`, and return it as float32. A traced value stays traced."""
-        argument = f"the argument {name}" if name in MODALITIES else f"measurements[{name!r}]"
-        if name not in (*self._inputs, *self.preprocessing.absent):
-            raise ValueError(
-                f"{self.name} does not accept {name}: the model was trained on {', '.join(self._inputs)}. Leave out "
-                f"{argument}."
-            )
+    def _input(self, name: str, value: ArrayLike) -> np.ndarray | Array:
+        """Check the name, type and shape of an input, and return it as float32. A traced value stays traced."""
         if name in self.preprocessing.absent:
             raise ValueError(
-                f"{self.name} cannot use {name}: the input {name} was absent from all first frames of the training "
-                f"data (before a fall, for example, nothing touches the pad). Leave out {argument}, or use a model of "
-                "another scenario."
+                f"{self.name} cannot use {name}: no first frame of its training data had it (before a fall, for "
+                "example, nothing touches the pad). Leave it out, or use a model of another scenario."
             )
+        if name not in self._inputs and not (name == "state" and "state" in self._shapes):
+            raise ValueError(
+                f"{self.name} does not accept {name}: it was trained on {', '.join(self._inputs)}. Leave it out."
+            )
+        array = _array(value)
         tail, is_image = self._shapes[name], self._kinds[name] == "image"
-        array = _arguments.checked_array(name, value, "floats in [0, 1]" if is_image else f"{tail[0]} numbers")
         if not jnp.issubdtype(array.dtype, jnp.floating):
             raise ValueError(
                 f"{name} is {array.dtype}, but it must be floating-point"
@@ -345,58 +292,78 @@ class Predictor:
                 f"{name} has shape {array.shape}, but {self.name} needs shape (..., {', '.join(map(str, tail))})"
                 + (f": render with resolution={tail[:2]}." if is_image and name in MODALITIES else ".")
             )
-        if math.prod(array.shape) == 0:
-            raise ValueError(f"{name} has shape {array.shape}, which contains no item: pass at least one item.")
-        return _arguments.float32(array)
+        return _float32(array)
 
-    def _checked_state(self, value: Any, lead: tuple[int, ...]) -> np.ndarray | Array:
-        """Check the argument `state`, and return it as float32."""
-        if isinstance(self.model.config, mvae.Config):
-            raise ValueError(
-                f"{self.name} does not accept the argument `state`, because it is not a state-space model: leave out "
-                "`state`."
-            )
-        array = _arguments.checked_array("state", value, f"{statespace.STATE_CODE} numbers, from statespace.encode")
-        if array.shape != (*lead, statespace.STATE_CODE):
-            raise ValueError(f"state has shape {array.shape}, but it must have shape {(*lead, statespace.STATE_CODE)}.")
-        if not _arguments.traced(array) and not np.isfinite(array).all():
-            raise ValueError("state has NaN or infinite values: give finite numbers, or leave out the argument state.")
-        return _arguments.float32(array)
-
-    def _checked_condition(
-        self, value: Any, lead: tuple[int, ...]
+    def _condition(
+        self, condition: Any, lead: tuple[int, ...]
     ) -> tuple[np.ndarray | Array | None, Bool[Array, "*n"] | None]:
-        """Check the argument `condition`. Return it as float32 and, if it is traced, a mask of the plausible items."""
+        """Check the condition. Return it as float32 and, if it is traced, a mask of the items in range."""
         width = self.model.config.condition
-        array = None if value is None else _arguments.checked_array("condition", value, f"{width} numbers in SI units")
-        shape = None if array is None else array.shape
-        if width == 0 and shape is not None:
+        shape, needed = None if condition is None else condition.shape, (*lead, width) if width else None
+        if shape != needed:
             raise ValueError(
-                f"condition has shape {shape}, but {self.name} accepts no condition: leave out the argument condition."
+                f"condition has shape {shape}, but {self.name} needs {needed} (None: leave out the condition), in SI "
+                "units."
             )
-        if width != 0 and shape != (*lead, width):
-            given = "condition is missing" if shape is None else f"condition has shape {shape}"
-            raise ValueError(
-                f"{given}, but {self.name} needs a condition of shape {(*lead, width)}: give an array of this "
-                "shape, in SI units."
-            )
-        if array is None:
+        if condition is None:
             return None, None
-        if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
-            raise ValueError(f"condition has the type {array.dtype}, but it must be an array of numbers in SI units.")
-        condition = _arguments.float32(array)
-        scale = np.array(self.preprocessing.condition_scale)
-        if _arguments.traced(condition):
-            return condition, jnp.all(jnp.abs(condition) <= _LARGEST_CONDITION * scale, axis=-1)
-        if not np.isfinite(condition).all():
-            raise ValueError("condition has NaN or infinite values: give finite numbers for every item.")
-        if (np.abs(condition) > _LARGEST_CONDITION * scale).any():
+        condition = _float32(condition)
+        limit = _LARGEST_CONDITION * np.array(self.preprocessing.condition_scale)
+        fine = (abs(condition) <= limit).all(axis=-1)
+        if _traced(fine):
+            return condition, fine
+        if not fine.all():
             raise ValueError(
                 f"condition has magnitudes up to {np.abs(condition).reshape(-1, width).max(0).tolist()}, but the "
-                f"limits are {(_LARGEST_CONDITION * scale).tolist()} ({_LARGEST_CONDITION:g} times the typical "
-                "magnitudes in the model's scenario): give the condition in SI units."
+                f"limits are {limit.tolist()} ({_LARGEST_CONDITION:g} times the typical magnitudes): give finite "
+                "numbers in SI units."
             )
         return condition, None
+
+
+def _traced(value: object) -> bool:
+    return isinstance(value, jax.core.Tracer)
+
+
+def _array(value: Any) -> np.ndarray | Array:
+    return value if isinstance(value, jax.Array) else np.asarray(value)
+
+
+def _float32(array: Any) -> Any:
+    """Convert an array to float32. Numbers that are too large become infinite, and a later check rejects them."""
+    with np.errstate(over="ignore"):
+        return array.astype(np.float32)
+
+
+def _in_range(kind: Kind, array: Any) -> Any:
+    """Find the items of a batch whose numbers are in the range of their kind, with JAX only if they are traced."""
+    xp = jnp if _traced(array) else np
+    if kind == "vector":
+        return xp.isfinite(array).all(-1)
+    if kind == "pose":
+        with np.errstate(over="ignore", invalid="ignore"):
+            lengths = xp.linalg.norm(array[..., 3:], axis=-1)
+            return (abs(lengths - 1) <= _QUAT_TOLERANCE) & (abs(array[..., :3]) <= _FARTHEST).all(-1)
+    return xp.asarray((array >= 0) & (array <= 1)).all((-3, -2, -1))
+
+
+def _reason(name: str, kind: Kind, items: np.ndarray) -> str:
+    """The message for items that are not in the range of their kind."""
+    if not np.isfinite(items).all():
+        return f"{name} has NaN or infinite values: exclude such items with present={{{name!r}: mask}}."
+    if kind == "image":
+        return (
+            f"{name} has values in [{items.min():.3g}, {items.max():.3g}], but images must be in [0, 1]: divide by 255 "
+            "if the values are 8-bit."
+        )
+    lengths = np.linalg.norm(items[..., 3:].astype(np.float64), axis=-1)  # squares of 1e30 are beyond float32
+    length = lengths.flat[np.abs(lengths - 1).argmax()]
+    if abs(length - 1) > _QUAT_TOLERANCE:
+        return f"pose has a quaternion of length {length:.5g}: give a position (m) and a unit quaternion [w, x, y, z]."
+    return (
+        f"pose has a coordinate of {np.abs(items[..., :3]).max():.3g} m, but at most {_FARTHEST:g} m is allowed: give "
+        "metres, not millimetres."
+    )
 
 
 def _located(folder: str | Path) -> Path:
@@ -413,18 +380,12 @@ def _located(folder: str | Path) -> Path:
     return MODELS / name
 
 
-def _check_view(name: str, config: statespace.Config, preprocessing: training.Preprocessing) -> None:
-    """Raise a ValueError if the preprocessing differs from the view or pose encoding that the networks need."""
-    presumed = {
-        "resolution": (config.input_size,) * 2,
-        "crop": False,
-        "rotation": "matrix",
-        "position_scale": config.position_scale,
-    }
-    for field, wanted in presumed.items():
-        found = getattr(preprocessing, field)
-        if found != wanted:
+def _compare(name: str, preprocessing: training.Preprocessing, needed: dict[str, Any]) -> None:
+    """Raise a ValueError if a field of the preprocessing has another value than needed."""
+    for field, value in needed.items():
+        trained = getattr(preprocessing, field)
+        if trained != value:
             raise ValueError(
-                f"{name} is a state-space model and needs preprocessing with {field}={wanted!r}, but its preprocessing "
-                f"has {field}={found!r}: train the model with {field}={wanted!r}."
+                f"{name} was trained with {field}={trained!r}, but {field}={value!r} is needed: use images with "
+                f"{field}={trained!r}, or train a model with {field}={value!r}."
             )

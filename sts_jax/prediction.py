@@ -20,22 +20,16 @@ _CLOSE = 1e-6  # m, distance below which the weight of a sample in Weiszfeld's m
 
 
 class Prediction(NamedTuple):
-    """Prediction of the last frame of a trajectory. Modalities that the model does not predict are None."""
+    """Prediction of the last frame. Modalities that the model does not predict are None."""
 
-    # Visual image, sRGB in [0, 1].
-    visual: Float[Array, "*n h w 3"] | None
-    # Tactile image in [0, 1].
-    tactile: Float[Array, "*n h w 3"] | None
-    # Pose of the object: position (m) and unit quaternion with w >= 0, mesh frame in the sensor frame.
-    pose: Float[Array, "*n 7"] | None
-    # Mean of the posterior of the latent variables, given all inputs.
-    mean: Float[Array, "*n latent"]
-    # Logarithm of the variance of this posterior.
-    log_var: Float[Array, "*n latent"]
-    # Samples, None if `num_samples` is 0. Their images, poses and measurements have another leading axis of
-    # `num_samples`.
+    visual: Float[Array, "*n h w 3"] | None  # visual image, sRGB in [0, 1]
+    tactile: Float[Array, "*n h w 3"] | None  # tactile image in [0, 1]
+    pose: Float[Array, "*n 7"] | None  # pose of the object
+    mean: Float[Array, "*n latent"]  # mean of the posterior of the latent, given all inputs
+    log_var: Float[Array, "*n latent"]  # log variance of this posterior
+    # None if `num_samples` is 0. Images, poses and measurements of samples have another leading axis of `num_samples`.
     samples: "Prediction | None" = None
-    # Probability of each of the scenario's outcomes, in the order of `Predictor.outcomes`. None for an `mvae` model.
+    # Probability of each outcome, in the order of `Predictor.outcomes`. None for an `mvae` model.
     outcome_probability: Float[Array, "*n outcomes"] | None = None
     # Further modalities (`dataset.Measurement`) by name: numbers in SI units, or images in [0, 1].
     measurements: dict[str, Float[Array, "..."]] | None = None
@@ -63,30 +57,19 @@ def predict(
     num_samples: int = 0,
     shape: tuple[int, ...] = (),
 ) -> Prediction:
-    """Predict with a multimodal variational autoencoder (`mvae`).
-
-    The mean of the posterior of the latent variables, given the inputs, is decoded to images and a pose. The function
-    is pure. It is compiled once for each combination of the names and shapes of the inputs.
+    """Predict with a multimodal variational autoencoder: decode the mean of the posterior, given the inputs.
 
     Args:
         graphdef: Definition of the model.
         state: Parameters and running batch statistics of the model.
         preprocessing: Preprocessing with which the model was trained.
-        blank: Tactile image of the untouched sensor in [0, 1].
-        inputs: Inputs by the name of the modality. "visual" and "tactile" are images in [0, 1], (*n, height, width, 3).
-            "pose" is a position (m) and a unit quaternion, (*n, 7). Further modalities are vectors of numbers in SI
-            units, (*n, size), or images in [0, 1]. Any of these may be missing.
-        present: Masks (*n,) by the name of the modality. False means that the input of this modality is ignored for
-            this item of the batch. A modality without a mask is used for all items. Tactile images without contact are
-            always ignored, unless the model was trained with blank tactile images as inputs.
-        condition: Known parameters of each trajectory in SI units, (*n, c). None for a model that was trained without
-            known parameters.
+        blank: Tactile image of the empty sensor in [0, 1].
+        inputs: Inputs by name: images in [0, 1], poses (*n, 7), vectors in SI units. Any may be missing.
+        present: Masks (*n,) by name. An input without a mask is used for all items.
+        condition: Conditions in SI units, (*n, c), or None.
         key: Random key for the samples. If it is None, no samples are drawn.
-        num_samples: Number of samples to draw from the posterior. Each sample is decoded to images and a pose.
+        num_samples: Number of samples to draw from the posterior and to decode.
         shape: Leading axes of the prediction if `inputs` is empty. The prediction is then made from the prior.
-
-    Returns:
-        The prediction for each item.
     """
     lead = shape
     vectors = ("pose", *dict(preprocessing.scales))
@@ -105,14 +88,14 @@ def predict(
         wide = None if condition is None else jnp.broadcast_to(condition, (*z.shape[:-1], condition.shape[-1]))
         out = mvae.decode(graphdef, state, z, condition=wide)
         out = {name: value.reshape(*shape, *value.shape[z.ndim - 1 :]) for name, value in out.items()}
-        found = {name: preprocessing.decode(name, value) for name, value in out.items()}
+        values = {name: preprocessing.decode(name, value) for name, value in out.items()}
         return Prediction(
-            visual=found.pop("visual", None),
-            tactile=found.pop("tactile", None),
-            pose=found.pop("pose", None),
+            visual=values.pop("visual", None),
+            tactile=values.pop("tactile", None),
+            pose=values.pop("pose", None),
             mean=posterior.mean.reshape(*lead, -1),
             log_var=posterior.log_var.reshape(*lead, -1),
-            measurements=found or None,
+            measurements=values or None,
         )
 
     result = decode(posterior.mean, lead)
@@ -140,29 +123,21 @@ def predict_samples(
     """Predict with a state-space model, which draws samples of the final pose and of the images.
 
     The predicted images are means over `num_samples` samples, or over 16 samples if `num_samples` is 0. The predicted
-    position is the geometric median of at least 256 sampled positions. The predicted orientation is taken from one
-    sample: the sample whose mean distance (in position and angle) from the other samples is smallest.
+    position is the geometric median of at least 256 sampled positions. The predicted orientation is that of the sample
+    with the smallest mean distance (in position and angle) from the other samples.
 
     Args:
         graphdef: Definition of the model.
         state: Parameters of the model.
         preprocessing: Preprocessing with which the model was trained.
-        empty: Images "visual" and "tactile" of the untouched sensor in [0, 1].
-        inputs: All inputs of the model by the name of the modality: images (*n, height, width, 3) and poses (*n, 7).
-            For inputs that are not given, call `completed` first, which adds placeholders. The entry "state" is
-            optional. It contains codes (*n, code) of the true pose, shape and mass, from `statespace.encode`.
-        present: Masks (*n,) by the name of the modality. False means that the input of this modality is ignored for
-            this item of the batch.
-        condition: Known parameters of each trajectory in SI units, (*n, c). None for a model that was trained without
-            known parameters.
+        empty: Images "visual" and "tactile" of the empty sensor in [0, 1].
+        inputs: All inputs of the model by name, see `completed`, and optionally the state codes "state".
+        present: Masks (*n,) by name. An input without a mask is used for all items.
+        condition: Conditions in SI units, (*n, c), or None.
         key: Random key for the samples. None stands for `jax.random.key(0)`, so that every call gives the same result.
         num_samples: Number of samples to return in `Prediction.samples`.
         shape: Leading axes *n of the inputs and the prediction.
-        calibration: Calibration from `statespace.fit_calibration`. It corrects the probability density of the final
-            pose, and sets the contrast of the sampled images. None for no correction and the default contrast.
-
-    Returns:
-        The prediction for each item.
+        calibration: From `statespace.fit_calibration`. None for no correction and the default contrast.
     """
     lead = shape
     flat, counts = _flat(preprocessing, inputs, present, lead, empty["tactile"])
@@ -170,33 +145,29 @@ def predict_samples(
         condition = preprocessing.encode_condition(condition).reshape(-1, condition.shape[-1])
     drawn = num_samples or _DRAWN
     key = jax.random.key(0) if key is None else key
-    found = statespace.sample(
+    drawn_samples = statespace.sample(
         graphdef, state, key, flat, counts, empty, condition, calibration, num=max(_POSES, drawn), drawn=drawn
     )
-    poses = preprocessing.decode_pose(found.pose)
-    images = {name: x.reshape(drawn, *lead, *x.shape[2:]) for name, x in found.images.items()}
-    mean, log_var = (x.reshape(*lead, -1) for x in found.belief)
+    poses = preprocessing.decode_pose(drawn_samples.pose)
+    images = {name: x.reshape(drawn, *lead, *x.shape[2:]) for name, x in drawn_samples.images.items()}
+    mean, log_var = (x.reshape(*lead, -1) for x in drawn_samples.belief)
     result = Prediction(
-        visual=found.mean["visual"].reshape(*lead, *found.mean["visual"].shape[1:]),
-        tactile=found.mean["tactile"].reshape(*lead, *found.mean["tactile"].shape[1:]),
+        visual=drawn_samples.mean["visual"].reshape(*lead, *drawn_samples.mean["visual"].shape[1:]),
+        tactile=drawn_samples.mean["tactile"].reshape(*lead, *drawn_samples.mean["tactile"].shape[1:]),
         pose=_central(poses).reshape(*lead, 7),
         mean=mean,
         log_var=log_var,
-        outcome_probability=found.outcome.reshape(*lead, -1),
+        outcome_probability=drawn_samples.outcome.reshape(*lead, -1),
     )
     if num_samples:
-        own = poses[:drawn].reshape(drawn, *lead, 7)
-        samples = result._replace(visual=images["visual"], tactile=images["tactile"], pose=own)
+        drawn_poses = poses[:drawn].reshape(drawn, *lead, 7)
+        samples = result._replace(visual=images["visual"], tactile=images["tactile"], pose=drawn_poses)
         result = result._replace(samples=samples)
     return result
 
 
 def _central(poses: Float[Array, "k n 7"]) -> Float[Array, "n 7"]:
-    """Centre of k sampled poses, for each of n items.
-
-    The position of the centre is the geometric median of the sampled positions, computed by Weiszfeld's method. Its
-    orientation is that of the sample with the smallest mean distance from the other samples in position and angle.
-    """
+    """Centre of k sampled poses, for each of n items, see `predict_samples`."""
     place, quat = poses[..., :3], poses[..., 3:]
 
     def improved(_: Int[Array, ""], middle: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
@@ -217,16 +188,15 @@ def completed(
     present: dict[str, Any],
     lead: tuple[int, ...],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Add a placeholder, with a mask that is False, for each input that is not given.
+    """Add a placeholder with a mask that is False for each input that is not given.
 
-    The model always receives all inputs. One compiled program is therefore enough for all combinations of given inputs.
+    One compiled program is therefore enough for all combinations of given inputs.
 
     Args:
         names: Names of all inputs of the model.
         resolution: Height and width of the images (pixels).
         inputs: Inputs that are given, by name.
-        present: Masks that are given, by name. If an input is given without a mask, its mask is True for all items of
-            the batch.
+        present: Masks that are given, by name.
         lead: Sizes of the leading axes of the inputs.
 
     Returns:
@@ -266,11 +236,7 @@ def flagged(prediction: Prediction, valid: Bool[Array, "*n"], *, leading: int = 
     Args:
         prediction: Prediction, or the samples of a prediction.
         valid: Mask that is False for the invalid items.
-        leading: Number of axes that images, poses and measurements have before the axes of `valid`. It is 1 for samples
-            and 0 for all other predictions.
-
-    Returns:
-        The prediction with NaN in the invalid items.
+        leading: Number of axes that images, poses and measurements have before the axes of `valid`, 1 for samples.
     """
 
     def flag(leaf: Array, axes: int) -> Array:

@@ -1,4 +1,4 @@
-"""Atomic writing of files and folders, reading of files with helpful errors, checksums, and locks on folders."""
+"""Atomic writing of files and folders, reading of files with helpful errors, manifests, and locks on folders."""
 
 import contextlib
 import errno
@@ -26,21 +26,17 @@ class DamagedFileError(OSError):
 
 
 class LockedError(RuntimeError):
-    """A folder is already locked, by another process or by this one. The message names the folder and the process."""
+    """A folder is already locked, by another process or by this one."""
 
 
 def write_whole(path: Path, write: Callable[[Path], None]) -> None:
     """Write a file atomically. An interruption leaves either the complete new file or the previous state.
 
-    The content is written to a temporary file in the same folder, flushed to disk, and renamed to `path`. Missing
-    folders are created. Errors of `write` other than an OSError are raised unchanged.
+    Missing folders are created. An OSError names the file and the remedy. Other errors of `write` are raised unchanged.
 
     Args:
         path: The file.
-        write: Function that writes the content to the path of the temporary file.
-
-    Raises:
-        OSError: The file cannot be written. The message names the file and the remedy.
+        write: Function that writes the content to the path of a temporary file, which is then renamed to `path`.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
@@ -65,7 +61,7 @@ _IN_THE_WAY = (errno.EISDIR, errno.ENOTDIR, errno.EEXIST, errno.ENOTEMPTY)
 
 
 def remedy(error: Exception) -> str:
-    """Describe the remedy for a failed write. The remedy depends on `errno` if the error has this attribute."""
+    """The remedy for a failed write, by the `errno` of its error."""
     number = getattr(error, "errno", None)
     if number in _FULL:
         return "Free some disk space"
@@ -77,7 +73,7 @@ def remedy(error: Exception) -> str:
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write bytes to a file atomically. The function raises the same errors as `write_whole`."""
+    """Write bytes to a file atomically."""
 
     def write(temporary: Path) -> None:
         temporary.write_bytes(data)
@@ -86,11 +82,7 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write an object, such as a dictionary or a list, to a JSON file atomically.
-
-    Raises:
-        OSError: The file cannot be written. The message names the file and the remedy.
-    """
+    """Write an object, such as a dictionary or a list, to a JSON file atomically."""
     write_bytes(path, (json.dumps(content, indent=2) + "\n").encode())
 
 
@@ -100,13 +92,6 @@ def read_json(path: Path, remedy: str) -> Any:
     Args:
         path: The file.
         remedy: Text at the end of the error message, with the remedy for a damaged file.
-
-    Returns:
-        The content of the file.
-
-    Raises:
-        FileNotFoundError: The file does not exist.
-        DamagedFileError: The file cannot be read or is not JSON.
     """
     try:
         return json.loads(path.read_bytes().decode())
@@ -120,19 +105,15 @@ def decode(kind: type[Fields], values: Any, name: str) -> Fields:
     """Make an instance of a dataclass from JSON values, and check the types of the values.
 
     A list becomes a tuple. A whole number becomes a float if the type of its field is float. A JSON object becomes an
-    instance of a nested dataclass.
+    instance of a nested dataclass. A missing field takes its default.
 
     Args:
         kind: The dataclass. The types of its fields are numbers, strings, tuples, dataclasses, and unions of these.
         values: The fields by name, such as the result of `json.loads` or `dataclasses.asdict`.
         name: Name of the values in error messages, such as "device".
 
-    Returns:
-        The instance.
-
     Raises:
-        ValueError: A field is missing, unknown or of a wrong type, or the dataclass refuses a value. The message names
-            the field.
+        ValueError: A field is missing, unknown or of a wrong type, or the dataclass refuses a value.
     """
     try:
         return _adapter(kind).validate_json(json.dumps(values), strict=True, extra="forbid")
@@ -157,11 +138,7 @@ def _first_fault(fault: ErrorDetails, name: str) -> str:
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write named arrays to an `.npz` file atomically.
-
-    Raises:
-        OSError: The file cannot be written. The message names the file and the remedy.
-    """
+    """Write named arrays to an `.npz` file atomically."""
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **arrays)
     write_bytes(path, buffer.getvalue())
@@ -173,14 +150,6 @@ def read_arrays(path: Path, remedy: str) -> dict[str, np.ndarray]:
     Args:
         path: The file.
         remedy: Text at the end of the error message, with the remedy for a damaged file.
-
-    Returns:
-        The arrays by name.
-
-    Raises:
-        FileNotFoundError: The file does not exist.
-        OSError: The file cannot be read, for example because of its permissions.
-        DamagedFileError: The file is not a complete `.npz` file.
     """
     data = path.read_bytes()
     try:
@@ -193,11 +162,7 @@ def read_arrays(path: Path, remedy: str) -> dict[str, np.ndarray]:
 def claim(path: Path, content: dict) -> None:
     """Record settings in a JSON file, or check that an existing file has the same settings.
 
-    The check ensures that all results in a folder have the same settings.
-
-    Args:
-        path: The file.
-        content: The settings, of JSON types. Tuples count as lists.
+    The check ensures that all results in a folder have the same settings. Tuples count as lists.
     """
     content = json.loads(json.dumps(content))
     if not path.exists():
@@ -273,10 +238,7 @@ def read_manifest(folder: Path, remedy: str) -> Manifest | None:
 
     Args:
         folder: The folder.
-        remedy: Text at the end of the error message, with the remedy for a damaged file.
-
-    Raises:
-        DamagedFileError: The manifest is damaged or was edited.
+        remedy: Text at the end of the error message, with the remedy for a damaged or edited manifest.
     """
     path = folder / MANIFEST
     if not path.exists():
@@ -289,17 +251,13 @@ def read_manifest(folder: Path, remedy: str) -> Manifest | None:
 
 
 def verify(folder: Path, manifest: Manifest, remedy: str, names: Iterable[str] | None = None) -> None:
-    """Compare files of a folder with their checksums in its manifest.
+    """Compare files of a folder with their checksums in its manifest. The first that differs is named.
 
     Args:
         folder: The folder.
         manifest: Its manifest.
         remedy: Text at the end of the error message.
         names: Relative paths of the files to compare. None: all files of the manifest.
-
-    Raises:
-        DamagedFileError: A file is missing, cannot be read, has other content, or is not in the manifest. The message
-            names the file.
     """
     for name in manifest.files if names is None else names:
         path = folder / name
@@ -325,12 +283,8 @@ OWNER = ".lock-owner"  # file in a locked folder with the number of the process 
 def lock(folder: Path) -> Iterator[None]:
     """Lock a folder for this process until the `with` block or the process ends. A missing folder is created.
 
-    Args:
-        folder: The folder.
-
     Raises:
         LockedError: The folder is already locked, by another process or by this one.
-        OSError: The folder cannot be created or written to.
     """
     owner, held = folder / OWNER, filelock.FileLock(folder / ".lock", timeout=0)
     this = f"process {os.getpid()} on {platform.node()}"
@@ -366,18 +320,14 @@ def flush_folder(folder: Path) -> None:
 
 
 def write_folder(path: Path, files: Mapping[str, bytes], facts: Mapping[str, Any] | None = None) -> None:
-    """Create a folder with files and a manifest atomically. An interruption leaves the folder complete or as it was.
+    """Create a folder with files atomically. An interruption leaves either the complete folder or the previous state.
 
-    All files are on disk when the function returns.
+    All files are on disk when the function returns. An OSError names the folder and the remedy.
 
     Args:
         path: The folder. A folder that already exists must be empty.
-        files: Content of each file, by name.
+        files: The content of each file, by its name.
         facts: Facts of the manifest.
-
-    Raises:
-        OSError: A file cannot be written, or `path` is a file or a non-empty folder. The message names the folder and
-            the remedy.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:

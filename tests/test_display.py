@@ -34,19 +34,12 @@ def same(left, right):
         np.testing.assert_array_equal(a, b)
 
 
-def test_a_png_holds_both_streams_side_by_side(tmp_path):
-    sts.save(tmp_path / "frame.png", FRAME)
-    with Image.open(tmp_path / "frame.png") as picture:
+@pytest.mark.parametrize("name", ["frame.png", "frame.PNG"])
+def test_a_png_holds_both_streams_side_by_side(tmp_path, name):
+    sts.save(tmp_path / name, FRAME)
+    with Image.open(tmp_path / name) as picture:
         got = np.asarray(picture) / 255
     np.testing.assert_allclose(got, np.concatenate([FRAME.visual, FRAME.tactile], 1), atol=0.51 / 255)
-
-
-def test_suffixes_in_capitals_are_accepted(tmp_path):
-    sts.save(tmp_path / "frame.PNG", FRAME)
-    with Image.open(tmp_path / "frame.PNG") as picture:
-        assert (picture.format, picture.size) == ("PNG", (12, 4))
-    sts.save(tmp_path / "frame.NPZ", FRAME)
-    same(sts.load(tmp_path / "frame.NPZ"), FRAME)
 
 
 @pytest.mark.parametrize("thing", [FRAME, BODY], ids=["frame", "body"])
@@ -78,16 +71,6 @@ def test_a_damaged_file_raises_an_error_unless_the_damage_is_outside_the_arrays(
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(DamagedFileError, match=r"frame\.npz is damaged or was not written by this version"):
         sts.load(path)
-
-
-def test_a_file_that_cannot_be_read_is_not_called_damaged(tmp_path, monkeypatch):
-    def refuse(path):
-        raise PermissionError(13, "Permission denied", str(path))
-
-    sts.save(tmp_path / "x.npz", FRAME)
-    monkeypatch.setattr(type(tmp_path), "read_bytes", refuse)
-    with pytest.raises(PermissionError, match=r"x\.npz"):
-        sts.load(tmp_path / "x.npz")
 
 
 def test_a_file_of_another_format_raises_an_error(tmp_path):
@@ -136,17 +119,12 @@ def test_a_body_is_drawn_from_outside():
 @pytest.mark.parametrize(
     ("path", "thing", "error", "message"),
     [
-        ("a.npz", np.zeros((2, 2, 3)), TypeError, "type ndarray, but `save` can write only .* Trajectory to an"),
-        ("a.png", 3.0, TypeError, "`thing` has the type float, but it must be a Frame or an image"),
-        (
-            "a.png",
-            BODY,
-            TypeError,
-            r"`thing` is a Body, but .* to a \.png file: save it as \.npz, or draw it with sts\.show",
-        ),
+        ("a.npz", np.zeros((2, 2, 3)), TypeError, r"a ndarray, but only a .* Trajectory can be written to an \.npz"),
+        ("a.png", 3.0, TypeError, "`thing` is a float, but `show` draws"),
+        ("a.png", BODY, TypeError, r"`thing` is a Body, .* and a \.png file has a Frame or an image"),
         ("a.png", np.zeros((2, 2)), ValueError, r"shape \(2, 2\)"),
         ("a.png", np.full((2, 2, 3), 2.0), ValueError, r"in \[2.0, 2.0\]"),
-        ("a.png", np.full((2, 2, 3), np.nan), ValueError, "must be uint8, or floats"),
+        ("a.png", np.full((2, 2, 3), np.nan), ValueError, "must be uint8 or floats"),
         ("a.jpg", FRAME, ValueError, r"must end in \.npz"),
         ("a.png", jax.tree.map(lambda x: x[None], FRAME), ValueError, r"leading axes \(1,\)"),
     ],

@@ -51,15 +51,25 @@ def test_config_survives_json():
     assert mvae.Config.from_json(json.loads(json.dumps(PAPER.to_json()))) == PAPER
 
 
-@pytest.mark.parametrize("shape", [(30, 32, 3), (24, 24, 3), (64, 64)])
-def test_an_image_of_a_wrong_size_is_refused(shape):
-    with pytest.raises(ValueError, match="visual"):
-        mvae.Modality("visual", "image", shape)
+def vectors(*names):
+    return tuple(mvae.Modality(name, "vector", (2,)) for name in names)
 
 
-def test_a_name_given_twice_is_refused():
-    with pytest.raises(ValueError, match="each name once"):
-        mvae.Config((mvae.Modality("a", "vector", (2,)), mvae.Modality("a", "vector", (3,))))
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: mvae.Modality("visual", "image", (30, 32, 3)), "'visual' must be an 'image' of shape"),
+        (lambda: mvae.Modality("visual", "image", (24, 24, 3)), "'visual' must be an 'image' of shape"),
+        (lambda: mvae.Modality("visual", "image", (64, 64)), "'visual' must be an 'image' of shape"),
+        (lambda: mvae.Modality("pose", "vector", (2, 3)), "'pose' must be"),
+        (lambda: mvae.Modality("visual", "image", (64, 64, 3), start=1.0), "start must be a grey value"),
+        (lambda: mvae.Config(vectors("a", "a")), "each once"),
+        (lambda: mvae.Config(vectors("a"), widths=(4,)), "widths must have 4 numbers"),
+    ],
+)
+def test_a_configuration_out_of_range_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
 
 
 def test_batch_norm_weighs_samples():

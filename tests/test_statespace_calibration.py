@@ -12,11 +12,11 @@ from statespace_config import STATE, random_codes, random_states, state_model
 
 import sts_jax as sts
 from sts_jax import evaluation, mvae, statespace, storage, training
-from sts_jax.statespace import calibration, fitting, networks, poses, predict
+from sts_jax.statespace import calibration, networks, objective, poses, predict
 
 NUMBER = 40
 SUBSETS = ((), ("visual",), ("tactile",), ("visual", "tactile"), ("pose",), ("visual", "pose"), ("tactile", "pose"))
-NUMBERS = calibration.Calibration(*(jnp.asarray(np.linspace(low, 2, 8), jnp.float32) for low in (0.5, 0.7, 0.9, 1.1)))
+NUMBERS = statespace.Calibration(*(jnp.asarray(np.linspace(low, 2, 8), jnp.float32) for low in (0.5, 0.7, 0.9, 1.1)))
 
 
 def arrays(**changes):
@@ -75,7 +75,7 @@ def calibrated(fitted, tmp_path):
 
 def test_corrections_are_powers_and_a_factor():
     final = density(np.random.default_rng(0), 5, components=2)
-    found = calibration.corrected(final, jnp.float32(0.5), jnp.float32(2.0), jnp.float32(3.0))
+    found = predict.corrected(final, jnp.float32(0.5), jnp.float32(2.0), jnp.float32(3.0))
     power = np.exp(np.asarray(final.outcome)) ** 0.5
     np.testing.assert_allclose(np.exp(found.outcome), power / power.sum(1, keepdims=True), rtol=1e-5)
     weight = np.exp(np.asarray(final.weight)) ** 2
@@ -89,12 +89,12 @@ def test_fitted_variance_is_the_mean_of_squared_deviations():
     rng, number = np.random.default_rng(1), 400
     code, pose = random_states(rng, number), random_codes(rng, number)
     outcome = rng.integers(0, 3, number)
-    turn = np.asarray(fitting.rotation_between(code, pose)).reshape(number, 9)
+    turn = np.asarray(objective.rotation_between(code, pose)).reshape(number, 9)
     own = np.concatenate([np.asarray(pose), turn], axis=1)[:, None, None]
     final = density(rng, number)
     scatter = np.sqrt(1.7) * np.exp(0.5 * np.asarray(final.log_var)) * rng.normal(size=final.mean.shape)
     final = final._replace(mean=jnp.asarray(own - scatter, jnp.float32))
-    fitted = fitting._fitted(final, code, pose, jnp.asarray(outcome))
+    fitted = calibration._fitted(final, code, pose, jnp.asarray(outcome))
     chosen = np.arange(number), outcome, 0
     expected = np.mean((own[:, 0, 0] - np.asarray(final.mean)[chosen]) ** 2 / np.exp(np.asarray(final.log_var)[chosen]))
     assert 1.6 < expected < 1.8
@@ -107,11 +107,11 @@ def test_calibration_never_narrows_the_density_of_the_pose():
     code, pose = random_states(rng, number), random_codes(rng, number)
     final = density(rng, number)
     outcome = jnp.argmax(final.outcome, axis=1)
-    turn = np.asarray(fitting.rotation_between(code, pose)).reshape(number, 9)
+    turn = np.asarray(objective.rotation_between(code, pose)).reshape(number, 9)
     own = np.concatenate([np.asarray(pose), turn], axis=1)[:, None, None]
     near = own - 0.3 * np.exp(0.5 * np.asarray(final.log_var)) * rng.normal(size=final.mean.shape)
     final = final._replace(mean=jnp.asarray(near, jnp.float32))
-    fitted = fitting._fitted(final, code, pose, outcome)
+    fitted = calibration._fitted(final, code, pose, outcome)
     np.testing.assert_array_equal(fitted[1:], 1)
     assert 1 < fitted[0] <= 4
 
@@ -123,7 +123,7 @@ def test_fitted_power_recovers_the_power_of_drawn_outcomes(true):
     final = density(rng, number)
     chance = special.softmax(true * np.asarray(final.outcome, np.float64), axis=1)
     outcome = np.array([rng.choice(3, p=row) for row in chance])
-    assert abs(fitting._fitted(final, code, pose, jnp.asarray(outcome))[0] / true - 1) < 0.1
+    assert abs(calibration._fitted(final, code, pose, jnp.asarray(outcome))[0] / true - 1) < 0.1
 
 
 @pytest.mark.slow
@@ -139,12 +139,12 @@ def test_each_item_is_corrected_by_the_numbers_of_its_inputs():
 
     @jax.jit
     def run(present, correction):
-        return calibration.predict(nnx.merge(graphdef, params), inputs, present, empty, condition, correction)[1]
+        return predict.predict(nnx.merge(graphdef, params), inputs, present, empty, condition, correction)[1]
 
     plain, found = run(present, None), run(present, NUMBERS)
     for i, subset in enumerate(SUBSETS):
         number = sum(2 ** STATE.inputs.index(name) for name in subset)
-        expected = calibration.corrected(plain, *(x[number] for x in NUMBERS[:3]))
+        expected = predict.corrected(plain, *(x[number] for x in NUMBERS[:3]))
         for a, b in zip(found, expected, strict=True):
             np.testing.assert_allclose(a[i], b[i], rtol=1e-5, atol=1e-5)
 
@@ -162,7 +162,7 @@ def test_calibration_is_at_the_minimum_and_other_subsets_stay(folder):
 def test_calibration_changes_samples_and_survives_saving(folder, tmp_path):
     before = sts.Predictor.load(folder)
     training.save_calibration(
-        folder, calibration.Calibration(jnp.ones(8), jnp.ones(8), jnp.full(8, 4.0), jnp.full(8, 7.0)), STATE.inputs
+        folder, statespace.Calibration(jnp.ones(8), jnp.ones(8), jnp.full(8, 4.0), jnp.full(8, 7.0)), STATE.inputs
     )
     after = sts.Predictor.load(folder)
     after.save(tmp_path / "copy", compact=True)
@@ -184,24 +184,24 @@ def test_calibration_changes_samples_and_survives_saving(folder, tmp_path):
 def test_fitted_contrast_has_the_gradient_energy_of_the_true_images():
     """The energy at a contrast is that of samples. True images of this energy, plus 0.2 %, lead to this contrast."""
     given, chosen = arrays(), ["visual", "pose"]
-    chunks = list(fitting._chunks(given.inputs, given.empty, given.condition, chosen, np.arange(NUMBER)))
+    chunks = list(calibration._chunks(given.inputs, given.empty, given.condition, chosen, np.arange(NUMBER)))
     graphdef, params, _ = statespace.init(jax.random.key(0), STATE)
     params["decoder"]["last"]["bias"][...] += 3.0  # an untrained decoder covers hardly any pixel
-    chunk = np.arange(fitting._CHUNK) % NUMBER  # a call draws its samples for a whole chunk
-    inputs = {name: jnp.asarray(fitting._unit(x[chunk])) for name, x in given.inputs.items()}
-    empty = {name: jnp.asarray(fitting._unit(image)) for name, image in given.empty.items()}
+    chunk = np.arange(calibration._CHUNK) % NUMBER  # a call draws its samples for a whole chunk
+    inputs = {name: jnp.asarray(calibration._unit(x[chunk])) for name, x in given.inputs.items()}
+    empty = {name: jnp.asarray(calibration._unit(image)) for name, image in given.empty.items()}
     present = {name: jnp.full(len(chunk), name in chosen) for name in STATE.inputs}
-    condition, num, key = jnp.asarray(given.condition[chunk]), fitting._SAMPLES, jax.random.key(0)
+    condition, num, key = jnp.asarray(given.condition[chunk]), calibration._SAMPLES, jax.random.key(0)
     noise = np.random.default_rng(1).random((NUMBER, STATE.image_size, STATE.image_size, 3))
     noise /= np.sqrt(evaluation.metrics.gradient_energy(noise))[:, None, None, None]
-    for contrast in fitting.CONTRASTS:
-        numbers = calibration.Calibration(*(jnp.full(8, x) for x in (1.0, 1.0, 1.0, contrast)))
+    for contrast in calibration.CONTRASTS:
+        numbers = statespace.Calibration(*(jnp.full(8, x) for x in (1.0, 1.0, 1.0, contrast)))
         drawn = predict.sample(graphdef, params, key, inputs, present, empty, condition, numbers, num=num, drawn=num)
         energy = evaluation.metrics.gradient_energy(np.asarray(drawn.images["visual"][:, :NUMBER])).mean()
         target = np.asarray(noise * np.sqrt(1.002 * energy), np.float32)
-        assert fitting._contrast(graphdef, params, chunks, target, np.ones(3)) == contrast
+        assert calibration._contrast(graphdef, params, chunks, target, np.ones(3)) == contrast
     blank = np.zeros((NUMBER, STATE.image_size, STATE.image_size, 3), np.uint8)  # all objects fell off
-    assert fitting._contrast(graphdef, params, chunks, blank, np.ones(3)) == statespace.CONTRAST
+    assert calibration._contrast(graphdef, params, chunks, blank, np.ones(3)) == statespace.CONTRAST
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from statespace_config import TINY, random_codes, random_states
 from sts_jax import optics, statespace
 from sts_jax.evaluation import metrics
 from sts_jax.mvae import Gaussian
-from sts_jax.statespace import config, harmonics, layers, networks, objective, poses, state
+from sts_jax.statespace import config, harmonics, networks, objective, poses, state
 
 CONFIG = dataclasses.replace(
     TINY, inputs=("visual", "tactile", "pose"), outcomes=3, condition=3, input_size=32, drawn=0.5, drawn_first=0.5
@@ -147,7 +147,7 @@ def test_excess_equals_the_metric_and_is_zero_at_the_target():
 def test_reduced_images_are_means_of_blocks():
     image = np.random.default_rng(0).random((6, 6, 3), np.float32)
     expected = [[image[2 * i : 2 * i + 2, 2 * j : 2 * j + 2].mean((0, 1)) for j in range(3)] for i in range(3)]
-    np.testing.assert_allclose(objective.reduced(jnp.asarray(image), 3), expected, rtol=1e-5)
+    np.testing.assert_allclose(networks.reduced(jnp.asarray(image), 3), expected, rtol=1e-5)
 
 
 def test_log_density_is_that_of_a_mixture_in_the_turned_frame():
@@ -252,7 +252,7 @@ def test_decoder_draws_an_object_at_its_projection(model):
 
     @jax.jit
     def draw(code):
-        return layers.compose(nnx.merge(model[0], params).decoder(code, turns, known, look), grey)
+        return networks.compose(nnx.merge(model[0], params).decoder(code, turns, known, look), grey)
 
     drawn = draw(batch)
     for picture in drawn.values():
@@ -265,18 +265,18 @@ def test_decoder_draws_an_object_at_its_projection(model):
 def test_share_of_levels_that_cover_a_pixel_is_its_probability():
     chance = np.linspace(0.02, 0.98, 25).reshape(1, 5, 5, 1)
     logit = jnp.tile(jnp.asarray(np.log(chance / (1 - chance)), jnp.float32), (200, 1, 1, 1))
-    drawn = layers.Layers(logit, jnp.ones((200, 5, 5, 3)), jnp.zeros((200, 5, 5, 3)))
+    drawn = networks.Layers(logit, jnp.ones((200, 5, 5, 3)), jnp.zeros((200, 5, 5, 3)))
     empty = {"visual": jnp.zeros((5, 5, 3)), "tactile": jnp.full((5, 5, 3), 0.4)}
-    soft = layers.compose(drawn, empty)
+    soft = networks.compose(drawn, empty)
     np.testing.assert_allclose(soft["visual"][0], np.broadcast_to(chance[0], (5, 5, 3)), atol=1e-5)
     np.testing.assert_allclose(soft["tactile"], 0.4, rtol=1e-5)
-    sharp = layers.compose(drawn, empty, (jnp.arange(200) + 0.5) / 200)
+    sharp = networks.compose(drawn, empty, (jnp.arange(200) + 0.5) / 200)
     np.testing.assert_allclose(np.mean(sharp["visual"], axis=0), soft["visual"][0], atol=0.02)
     outlines = np.asarray(sharp["visual"])
     assert np.mean((outlines < 0.05) | (outlines > 0.95)) > 0.7
     np.testing.assert_array_equal(sharp["tactile"], soft["tactile"])
     level, contrast = jnp.full(200, 0.3), jnp.linspace(1, 9, 200)
-    softer = layers.compose(drawn, empty, level, contrast)["visual"]
+    softer = networks.compose(drawn, empty, level, contrast)["visual"]
     odds = (chance / (1 - chance) / (0.3 / 0.7))[0, None] ** np.asarray(contrast)[:, None, None, None]
     np.testing.assert_allclose(softer, np.broadcast_to(odds / (1 + odds), softer.shape), rtol=1e-3, atol=1e-6)
 
@@ -287,7 +287,7 @@ def test_belief_from_the_true_state_is_the_true_state(model, empty, batch):
 
     @jax.jit
     def believe(inputs, counts):
-        return objective.fuse(objective.experts(nnx.merge(*model), inputs, counts, empty), counts)
+        return networks.fuse(networks.experts(nnx.merge(*model), inputs, counts, empty), counts)
 
     belief, alone = believe(inputs, counts), believe(inputs, counts | {"state": jnp.zeros(NUMBER, bool)})
     np.testing.assert_allclose(belief.mean[:, : state.CODE], batch.targets["state"], atol=2e-3)
@@ -295,7 +295,7 @@ def test_belief_from_the_true_state_is_the_true_state(model, empty, batch):
 
 
 def test_tint_is_the_mean_colour_of_the_object_in_the_visual_image(model, empty, batch):
-    found = jax.jit(lambda inputs: objective.experts(nnx.merge(*model), inputs, batch.present, empty))(batch.inputs)
+    found = jax.jit(lambda inputs: networks.experts(nnx.merge(*model), inputs, batch.present, empty))(batch.inputs)
     rows = slice(state.CODE, state.CODE + config.TINT)
     for i, image in enumerate(np.asarray(batch.inputs["visual"], np.float64)):
         change = image - np.asarray(empty["visual"])
@@ -441,17 +441,6 @@ def test_beliefs_of_falls_are_exact_or_have_noise_of_their_variance():
     assert np.sqrt(noise).max() < 1.01
 
 
-def test_gradient_descent_lowers_the_loss(loss, batch, model):
-    params = jax.tree.map(np.asarray, model[1])  # NumPy needs no compilation
-    (first, _), gradient = loss(batch)
-    for _ in range(5):
-        gradient = jax.tree.map(np.asarray, gradient)
-        step = np.float32(0.1) / np.sqrt(sum(np.sum(leaf**2) for leaf in jax.tree.leaves(gradient)))
-        params = jax.tree.map(lambda p, g, step=step: p - step * g, params, gradient)
-        (last, _), gradient = loss(batch, params)
-    assert last < first - 10
-
-
 def test_samples_are_rotations_and_images_in_range(sample, batch):
     found = sample(batch)
     assert found.pose.shape == (6, NUMBER, 12)
@@ -478,22 +467,22 @@ def test_rigid_finds_the_nearest_rotation():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"inputs": ("pose",)}, "at least one input must be an image: add 'visual' or 'tactile'"),
-        ({"inputs": ("pose", "visual")}, "in this order"),
-        ({"inputs": ()}, "one or more of"),
-        ({"window": 12}, "window is 12 pixels, but it must be a positive multiple of 8"),
-        ({"input_size": 24}, "input_size is 24 pixels, but it must be a positive multiple of 16, the image_size"),
-        ({"encoder": (4, 4)}, "encoder has 2 widths and decoder has 3, but each must have 3"),
-        ({"condition": 1}, r"condition is 1 and vectors is 1, but they must satisfy condition >= 2 \* vectors >= 0"),
-        ({"drawn_first": 0.0}, r"drawn_first is 0\.0"),
-        ({"outcome_names": ("rests",)}, r"outcome_names is \('rests',\), but outcomes, the number of outcomes, is"),
+        ({"inputs": ("pose",)}, "inputs must be some of .* in this order, with an image"),
+        ({"inputs": ("pose", "visual")}, "inputs must be some of .* in this order, with an image"),
+        ({"window": 12}, "window must be a positive multiple of 8 pixels, got 12"),
+        ({"input_size": 24}, "input_size must be a positive multiple of 16 pixels, the image_size, got 24"),
+        ({"encoder": (4, 4)}, "encoder and decoder must have 3 widths each"),
+        ({"condition": 1}, r"condition must be >= 2 \* vectors >= 0, got condition=1 and vectors=1"),
+        ({"drawn_first": 0.0}, r"drawn_first is a share of a batch, .* got 0\.0"),
+        ({"outcome_names": ("rests",)}, "outcome_names must be empty or have 3 names"),
+        ({"weights": {"touch": 1.0}}, r"field model\.weights\.touch is unknown"),
     ],
 )
 def test_config_rejects_values_out_of_range(change, message):
-    values = CONFIG.to_json() | change
     with pytest.raises(ValueError, match=message):
-        statespace.Config.from_json(values)
-    assert statespace.Config.from_json(CONFIG.to_json()) == CONFIG
-    assert "outcome_names" not in CONFIG.to_json()  # as in the configurations of older versions
-    named = dataclasses.replace(CONFIG, outcome_names=("a", "b", "c")[: CONFIG.outcomes])
+        statespace.Config.from_json(CONFIG.to_json() | change)
+
+
+def test_config_survives_json():
+    named = dataclasses.replace(CONFIG, outcome_names=("a", "b", "c"), weights=statespace.LossWeights(tactile=2.0))
     assert statespace.Config.from_json(json.loads(json.dumps(named.to_json()))) == named

@@ -57,7 +57,7 @@ def test_ball_of_mean_size_and_unit_mass_has_the_code_zero():
         np.testing.assert_allclose(part, 0, atol=1e-5)
     heavier = state.split(encoded(rotations, 1.1 * ball, mass=np.e * state.MASS))
     np.testing.assert_allclose(heavier.mass, 1, rtol=1e-5)
-    for part in (heavier.own, heavier.shown):
+    for part in (heavier.support, heavier.support_in_sensor):
         np.testing.assert_allclose(part, np.eye(state.SUPPORT)[:1] * 0.1 * state.MEAN * np.ones((NUMBER, 1)), atol=1e-5)
 
 
@@ -68,11 +68,11 @@ def test_shown_shape_is_that_of_the_rotated_vertices():
     # The hull is smooth, because a fit mixes harmonics of higher degrees into the lower ones.
     points *= np.array([0.035, 0.025, 0.02]) / np.linalg.norm(points, axis=1)[:, None]
     parts = state.split(encoded(rotations, points))
-    np.testing.assert_allclose(parts.own, np.tile(fitted(points), (NUMBER, 1)), atol=1e-4)
+    np.testing.assert_allclose(parts.support, np.tile(fitted(points), (NUMBER, 1)), atol=1e-4)
     for i, rotation in enumerate(rotations):
         expected = fitted(rotation.apply(points))
-        np.testing.assert_allclose(parts.shown[i], expected, atol=0.02)
-        assert np.abs(parts.own[i] - expected).max() > 0.1
+        np.testing.assert_allclose(parts.support_in_sensor[i], expected, atol=0.02)
+        assert np.abs(parts.support[i] - expected).max() > 0.1
 
 
 def test_reach_is_the_depth_of_the_lowest_vertex():
@@ -90,7 +90,7 @@ def test_shown_centre_of_mass_is_the_rotated_one():
     com = np.array([0.004, -0.002, 0.007])
     parts = state.split(encoded(rotations, box(0.04, 0.03, 0.02), com=com))
     np.testing.assert_allclose(parts.com, np.tile(com, (NUMBER, 1)) / state.LENGTH, rtol=1e-5)
-    np.testing.assert_allclose(parts.low, rotations.apply(com) / state.LENGTH, atol=1e-5)
+    np.testing.assert_allclose(parts.com_in_sensor, rotations.apply(com) / state.LENGTH, atol=1e-5)
 
 
 def test_turned_state_is_the_state_of_the_turned_pose():

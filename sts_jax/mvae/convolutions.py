@@ -1,8 +1,8 @@
 """Convolutions and transposed convolutions with gradients that are fast on a CPU.
 
-XLA's CPU backend is slow for convolutions with `lhs_dilation`. JAX uses `lhs_dilation` for transposed convolutions and
-for the gradients of strided convolutions. The functions below use matrix products and convolutions without dilation
-instead. For small images and stride 1, a Fourier transform also saves most of the multiplications.
+XLA's CPU backend is slow for convolutions with `lhs_dilation`, which JAX uses for transposed convolutions and for the
+gradients of strided convolutions. The functions below use matrix products and convolutions without dilation instead.
+For small images and stride 1, a Fourier transform also saves most of the multiplications.
 
 Images have shape `(batch, height, width, channel)`. Kernels have shape `(size, size, in, out)`, and `size` must be a
 multiple of `stride`.
@@ -25,18 +25,14 @@ def conv(
 ) -> Float[Array, "batch ho wo out"]:
     """Convolve images as neural networks do, without flipping the kernel.
 
-    Along each axis, the output is `y[i] = sum_a x[stride i + a - padding] kernel[a]`, summed over the input channels.
+    `y[i] = sum_a x[stride i + a - padding] kernel[a]` along each axis, summed over the input channels. Pixels outside
+    the images count as 0. The output has `(h + 2 padding - size) // stride + 1` rows, and columns likewise.
 
     Args:
-        x: Images. Pixels outside their borders count as 0.
-        kernel: Weights of shape (size, size, in, out). The side `size` of the kernel must be a multiple of `stride`.
-            The third axis belongs to the channels of `x`, and the fourth axis to the channels of the output.
+        x: Images.
+        kernel: Weights.
         stride: Step of the kernel from one output pixel to the next, in input pixels.
         padding: Number of zeros before the first and after the last pixel of each axis, at most `size - 1`.
-
-    Returns:
-        Images with `(h + 2 padding - size) // stride + 1` rows, where h is the number of rows of `x`. The number of
-        columns follows from the number of columns of `x` in the same way.
     """
     height, width = (n + 2 * padding - len(kernel) + 1 for n in x.shape[1:3])
     if stride == 1 and (height + len(kernel) - 1) * (width + len(kernel) - 1) <= _SMALL:
@@ -48,21 +44,16 @@ def conv(
 def conv_transpose(
     x: Float[Array, "batch h w in"], kernel: Float[Array, "size size in out"], stride: int, padding: int
 ) -> Float[Array, "batch ho wo out"]:
-    """Apply a transposed convolution, the transpose of the linear map `conv`. A `stride` above 1 enlarges the images.
+    """Apply the transpose of the linear map `conv`. A `stride` above 1 enlarges the images.
 
-    The kernel is multiplied by each input pixel, and the products are added to the output. Along each axis, this is
-    `y[stride i + a - padding] += x[i] kernel[a]`, summed over the input channels.
+    `y[stride i + a - padding] += x[i] kernel[a]` along each axis, summed over the input channels. The output has
+    `stride (h - 1) + size - 2 padding` rows, and columns likewise.
 
     Args:
         x: Images.
-        kernel: Weights of shape (size, size, in, out). The side `size` of the kernel must be a multiple of `stride`.
-            The third axis belongs to the channels of `x`, and the fourth axis to the channels of the output.
+        kernel: Weights.
         stride: Step of the kernel from one input pixel to the next, in output pixels.
         padding: Number of rows and columns that are cut from each side of the output.
-
-    Returns:
-        Images with `stride (h - 1) + size - 2 padding` rows, where h is the number of rows of `x`. The number of
-        columns follows from the number of columns of `x` in the same way.
     """
     height, width = (stride * (n - 1) + len(kernel) - 2 * padding for n in x.shape[1:3])
     if stride == 1 and (height + 2 * padding) * (width + 2 * padding) <= _SMALL:
@@ -80,15 +71,7 @@ def _fourier(height: int, width: int, size: int, padding: int) -> tuple[np.ndarr
     discrete Fourier transforms on a grid of `height + size - 1` by `width + size - 1` points. This grid contains the
     larger image and its padding, so that no product wraps around. A complex product takes three real products (Gauss),
     and half of the frequencies suffice for real images. For 5x5 pixels and a kernel of 4x4, 94 products replace 400.
-
-    Args:
-        height: Height of the smaller image.
-        width: Width of the smaller image.
-        size: Side of the kernel.
-        padding: Rows and columns of the grid on each side of the larger image.
-
-    Returns:
-        A, B and C. Each matrix has a row for every product, and a column for every pixel of its image or kernel.
+    `height` and `width` are those of the smaller image.
     """
     n, m = height + size - 1, width + size - 1
     u, v = np.divmod(np.arange(n * m), m)
@@ -192,8 +175,7 @@ def _cut(x: Array, start: int, height: int, width: int) -> Array:
 def _fold(x: Array, stride: int, padding: int, counts: list[int]) -> Array:
     """Turn each block of `stride` x `stride` pixels into one pixel with more channels.
 
-    `counts` is the number of blocks along the height and the width. The first block begins `padding` pixels before the
-    image.
+    `counts` has the blocks along height and width. The first begins `padding` pixels before the image.
     """
     h, w = counts
     x = _cut(x, -padding, stride * h, stride * w).reshape(len(x), h, stride, w, stride, -1)

@@ -1,24 +1,18 @@
 """The training loss and the predictions of the MVAE.
 
-The loss is a negative time-lagged evidence lower bound, summed over subsets of the modalities. The model sees inputs
-`x_t` at the time t and predicts targets `x_T` at a later time T. Training minimises
+The model sees inputs `x_t` at the time t and predicts targets `x_T` at a later time T. Training minimises a negative
+time-lagged evidence lower bound, summed over the non-empty subsets X of the modalities and averaged over the batch
+(paper, "Learning Intuitive Physics with MVAEs"):
 
 `L(x_t, x_T) = sum_X [ sum_{m in asked(X)} lambda_m E_{q(z | X_t)} E_m(x_T, z) + beta KL(q(z | X_t) || N(0, I)) ]`
 
-(paper, "Learning Intuitive Physics with MVAEs"), averaged over the batch.
+`asked(X)` are the modalities that the subset has to predict, and `q(z | X_t)` is the product of its experts, from which
+one `z` is drawn. `E_m` is the error of the prediction: the binary cross-entropy of an image (nats, summed over pixels
+and channels), or the mean squared error of the components of a vector. `lambda_m` is `Modality.weight`.
 
-- `X` runs over the non-empty subsets of the modalities, and `X_t` are the inputs of these modalities.
-- `asked(X)` are the modalities that the subset has to predict.
-- `q(z | X_t)` is the posterior of the latent `z`, a product of experts. `E_{q(z | X_t)}` is the expectation over this
-  posterior, which is estimated from one random draw of `z`.
-- `E_m` is the error of the prediction of modality m: the binary cross-entropy of an image (nats, summed over pixels and
-  channels), or the mean squared error of the components of a vector. `lambda_m` is `Modality.weight`.
-- `beta` weights the divergence.
-
-If a sample of the batch has inputs, but none from the modalities of a subset, the loss of this sample omits the subset.
-The reason is that the posterior of the subset is the prior, so `z` contains no information about the sample. Decoders
-that predict targets from such a `z` learn to mix the mean target into every prediction. If a sample has no input at
-all, the loss of this sample keeps all subsets, because the mean target is then the right prediction.
+If a sample has inputs, but none from the modalities of a subset, its loss omits the subset. The posterior of the subset
+is the prior, and decoders that predict from such a `z` learn to mix the mean target into every prediction. If a sample
+has no input at all, its loss keeps all subsets, because the mean target is then the right prediction.
 """
 
 from typing import Literal, NamedTuple
@@ -33,14 +27,9 @@ from sts_jax.mvae.networks import MVAE, Config, Modality
 
 
 class Terms(NamedTuple):
-    """The loss of a batch, the divergence of the posterior from the prior, and the error of each modality.
+    """The loss of a batch and its parts, without the factors `beta` and `Modality.weight`.
 
-    In the loss, the divergence is multiplied by `beta`, and each error by `Modality.weight`. The fields `kl` and
-    `reconstruction` do not contain these factors.
-
-    Both fields are means over combinations of a sample and a subset of the modalities. The means exclude the
-    combinations that the loss ignores. For example, the loss ignores a combination if the sample has inputs, but all
-    of them belong to modalities outside the subset.
+    The parts are means over the combinations of a sample and a subset that the loss does not omit.
     """
 
     loss: Float[Array, ""]  # the weighted sum that is minimised, averaged over the batch
@@ -85,21 +74,12 @@ def loss(
     asked: Literal["all", "own"] = "all",
     absent: tuple[str, ...] = (),
 ) -> tuple[Float[Array, ""], tuple[nnx.State, Terms]]:
-    """Compute the loss of one batch in training mode: a negative evidence lower bound, see the docstring of the module.
-
-    The loss is a sum over all non-empty subsets of the modalities, averaged over the batch. For each subset, the model
-    predicts the targets from the inputs of the modalities in the subset.
+    """Compute the loss of one batch in training mode, see the docstring of the module.
 
     The `absent` modalities are removed from all subsets. If several subsets are then equal, the term of one subset is
-    computed and multiplied by the number of equal subsets. If the mask of a modality in `present` is False for all
-    samples, the loss is the same as with the modality in `absent`, but the computation takes longer.
-
-    For each modality, one call of the decoder predicts the targets for all subsets. Batch normalisation computes one
-    mean and one variance of each channel for this call. A prediction for n equal subsets has the weight n in this
-    mean and this variance.
-
-    In each sample, a subset uses only those of its modalities that the masks in `present` do not exclude. Two subsets
-    that use the same modalities of a sample also use the same noise for the latent `z` of this sample.
+    computed and multiplied by their number. For each modality, one call of the decoder predicts the targets for all
+    subsets, with one batch normalisation, in which a prediction for n equal subsets has the weight n. Two subsets that
+    use the same modalities of a sample also use the same noise for its `z`.
 
     Args:
         graphdef: Definition of the model, from `init`.
@@ -108,24 +88,18 @@ def loss(
         key: Random key for the noise of `z`.
         inputs: Inputs by modality, `(batch, *shape)`. Images are in [0, 1]. A modality without an input counts as
             absent.
-        targets: Targets of all modalities at a later time than the inputs, `(batch, *shape)`. Images are in [0, 1].
-        present: Masks of the inputs by modality, `(batch,)`. True means that the sample has the input. An input without
-            a mask is present in all samples. Values of samples whose mask is False have no influence and may be NaN.
-        target_present: Masks of the targets by modality, `(batch,)`. True means that the sample has the target. A
-            target whose mask is False adds 0 to the loss. The loss is still divided by the size of the whole batch.
-        condition: Numbers that are appended to the latent of each sample, `(batch, condition)`. None if
-            `config.condition` is 0.
+        targets: Targets of all modalities, `(batch, *shape)`. Images are in [0, 1].
+        present: Masks of the inputs by modality. True means that the sample has the input. An input without a mask is
+            present in all samples. Values of samples whose mask is False have no influence and may be NaN.
+        target_present: Masks of the targets by modality. A target whose mask is False adds 0 to the loss, which is
+            still divided by the size of the whole batch.
+        condition: Numbers that are appended to the latent of each sample.
         beta: Weight of the divergence of the posterior from the prior.
-        asked: Modalities that are predicted for each subset. `all` predicts all modalities. `own` predicts only the
-            members of the subset, as in the paper's code.
+        asked: `all` predicts all modalities for each subset, `own` only its members, as in the paper's code.
         absent: Names of modalities that are not inputs of any sample.
 
     Returns:
         A tuple `(loss, (stats, terms))` with the loss, the new running batch statistics, and the terms of the loss.
-
-    Raises:
-        ValueError: The name of a modality is unknown, `asked` is unknown, a target is missing, or `condition` has
-            another width than the model needs.
     """
     model = nnx.merge(graphdef, params, stats, copy=True)
     config = model.config
@@ -169,30 +143,20 @@ def infer(
     *,
     present: dict[str, Bool[Array, "batch"]] | None = None,
 ) -> Gaussian:
-    """Compute the posterior `q(z | X)` of the latent z, given the inputs X of any subset of the modalities.
-
-    Batch normalisation uses the running statistics.
+    """Compute the posterior `q(z | X)`, with the running batch statistics. Without any input, it is the prior.
 
     Args:
         graphdef: Definition of the model, from `init`.
         state: Parameters and running batch statistics, `nnx.merge_state(params, stats)`.
         inputs: Inputs by modality, at least one, `(batch, *shape)`. Images are in [0, 1].
-        present: Masks of the inputs by modality, `(batch,)`. True means that the sample has the input. An input without
-            a mask is present in all samples.
-
-    Returns:
-        Mean and log variance of the posterior, `(batch, latent)`. For a sample without any input, the posterior is the
-        standard normal prior.
-
-    Raises:
-        ValueError: `inputs` is empty, or a key of `inputs` or `present` is not the name of a modality.
+        present: Masks of the inputs by modality. An input without a mask is present in all samples.
     """
     model = nnx.merge(graphdef, state)
     unknown = sorted({*inputs, *(present or {})} - set(model.config.names))
     if unknown or not inputs:
         raise ValueError(
-            f"`inputs` has the names {list(inputs)} and `present` has the names {list(present or {})}: give at "
-            f"least one input, and use only the names of the model's modalities {list(model.config.names)}"
+            f"the inputs are {list(inputs)} and the masks {list(present or {})}: give at least one input, and use only "
+            f"the names {list(model.config.names)}"
         )
     absent = tuple(name for name in model.config.names if name not in inputs)
     batch = len(next(iter(inputs.values())))
@@ -206,20 +170,16 @@ def decode(
     *,
     condition: Float[Array, "*batch condition"] | None = None,
 ) -> dict[str, Array]:
-    """Predict every modality from a latent. Batch normalisation uses the running statistics.
+    """Predict every modality from a latent, with the running batch statistics.
 
     Args:
         graphdef: Definition of the model, from `init`.
         state: Parameters and running batch statistics, `nnx.merge_state(params, stats)`.
-        z: Latents, `(*batch, latent)`.
-        condition: Numbers that are appended to each latent, `(*batch, condition)`. None if `config.condition` is 0.
+        z: Latents.
+        condition: Numbers that are appended to each latent.
 
     Returns:
-        The predictions by modality, `(*batch, *shape)`. Images are logits, which `jax.nn.sigmoid` converts to values
-        in [0, 1].
-
-    Raises:
-        ValueError: `condition` has another width than the model needs.
+        The predictions by modality, `(*batch, *shape)`. Images are logits.
     """
     model = nnx.merge(graphdef, state)
     z = _with_condition(model.config, z, condition)
@@ -235,24 +195,9 @@ def predict(
     present: dict[str, Bool[Array, "batch"]] | None = None,
     condition: Float[Array, "batch condition"] | None = None,
 ) -> tuple[dict[str, Array], Gaussian]:
-    """Predict every modality from the inputs of any subset of the modalities.
+    """Predict every modality from the mean of the posterior. Return the predictions and the posterior.
 
-    The predictions are decoded from the mean of the posterior. Batch normalisation uses the running statistics.
-
-    Args:
-        graphdef: Definition of the model, from `init`.
-        state: Parameters and running batch statistics, `nnx.merge_state(params, stats)`.
-        inputs: Inputs by modality, at least one, `(batch, *shape)`. Images are in [0, 1].
-        present: Masks of the inputs by modality, `(batch,)`. True means that the sample has the input. An input without
-            a mask is present in all samples.
-        condition: Numbers that are appended to each latent, `(batch, condition)`. None if `config.condition` is 0.
-
-    Returns:
-        The predictions by modality, as from `decode`, and the posterior, as from `infer`.
-
-    Raises:
-        ValueError: `inputs` is empty, a key of `inputs` or `present` is not the name of a modality, or `condition` has
-            another width than the model needs.
+    The arguments are those of `infer` and `decode`.
     """
     posterior = infer(graphdef, state, inputs, present=present)
     return decode(graphdef, state, posterior.mean, condition=condition), posterior
@@ -261,24 +206,11 @@ def predict(
 def _check(
     config: Config, asked: str, absent: tuple[str, ...], targets: dict[str, Array], given: dict[str, Array]
 ) -> None:
-    if asked not in ("all", "own"):
-        raise ValueError(f"`asked` is {asked!r}, but it must be 'all' or 'own'")
-    if set(absent) - set(config.names):
+    unknown = sorted((set(absent) | set(given)) - set(config.names))
+    if unknown or set(targets) != set(config.names) or asked not in ("all", "own"):
         raise ValueError(
-            f"`absent` is {absent}, but the model has only the modalities {config.names}: use only "
-            "the names of these modalities"
-        )
-    unknown = sorted(set(given) - set(config.names))
-    if unknown:
-        raise ValueError(
-            f"`inputs`, `present` or `target_present` has the names {unknown}, but the model has only the modalities "
-            f"{config.names}: use only the names of these modalities"
-        )
-    if set(targets) != set(config.names):
-        raise ValueError(
-            f"targets has the names {sorted(targets)}, but the loss needs exactly one target for each modality "
-            f"{sorted(config.names)}: add or remove targets. If some samples lack a target, set target_present to "
-            "False for these samples"
+            f"the model has the modalities {config.names}, and needs exactly these targets, got targets "
+            f"{sorted(targets)}, unknown names {unknown}, and asked={asked!r} ('all' or 'own')"
         )
 
 
@@ -324,8 +256,7 @@ def _noise(key: PRNGKeyArray, groups: list[_Group], left: Array, shape: tuple[in
 def _with_condition(config: Config, z: Array, condition: Array | None) -> Array:
     width = 0 if condition is None else condition.shape[-1]
     if width != config.condition:
-        remedy = f"an array of width {config.condition}" if config.condition else "None"
-        raise ValueError(f"condition has width {width}, but the model needs width {config.condition}: give {remedy}")
+        raise ValueError(f"condition has width {width}, but the model needs width {config.condition}")
     if condition is None:
         return z
     return jnp.concatenate([z, jnp.broadcast_to(condition, (*z.shape[:-1], width))], axis=-1)

@@ -7,29 +7,22 @@ from jaxtyping import Array, Bool, Float
 
 
 class Gaussian(NamedTuple):
-    """A Gaussian with independent components, given by their means and the logarithms of their variances."""
+    """A Gaussian with independent components."""
 
     mean: Float[Array, "*batch latent"]  # mean of each component
     log_var: Float[Array, "*batch latent"]  # natural logarithm of the variance of each component
 
 
 def product_of_experts(experts: Gaussian, present: Bool[Array, "modality *batch"]) -> Gaussian:
-    """Combine the estimates of the latent from several modalities into one posterior.
+    """The normalised product of the standard normal prior and of the experts that are present.
 
-    An expert is the Gaussian `N(z; mean_m, var_m)` that the input of modality m gives for the latent z. The posterior
-    is the normalised product of the standard normal prior and of all experts that are present. For the set X of present
-    experts, `q(z | X) = N(z; 0, I) prod_{m in X} N(z; mean_m, var_m) / Z`, where Z normalises the product.
-
-    With the precisions `T_m = 1 / var_m`, the variance of the posterior is `var = 1 / (1 + sum_m T_m)`, and the mean is
-    `var sum_m T_m mean_m`. Without any expert, the posterior is the prior.
+    `q(z | X) = N(z; 0, I) prod_{m in X} N(z; mean_m, var_m) / Z`. With the precisions `T_m = 1 / var_m`, its variance
+    is `var = 1 / (1 + sum_m T_m)`, and its mean is `var sum_m T_m mean_m`.
 
     Args:
         experts: Mean and log variance of each expert, `(modality, *batch, latent)`. Absent experts may have any finite
             values.
         present: True for each expert that is present, `(modality, *batch)`.
-
-    Returns:
-        Mean and log variance of the posterior, `(*batch, latent)`.
 
     Source: the paper's equation for the product of experts (PoE), and Wu and Goodman 2018, section 2.2.
     """
@@ -42,11 +35,5 @@ def kl_standard_normal(g: Gaussian) -> Float[Array, "*batch"]:
     """Kullback-Leibler divergence of a Gaussian from the standard normal prior (nats).
 
     `KL(g || N(0, I)) = sum(mean^2 + var - 1 - log var) / 2`, summed over the latent components.
-
-    Args:
-        g: Mean and log variance, `(*batch, latent)`.
-
-    Returns:
-        The divergence of each item, `(*batch,)`.
     """
     return 0.5 * jnp.sum(g.mean**2 + jnp.exp(g.log_var) - 1 - g.log_var, axis=-1)

@@ -1,8 +1,5 @@
 """The paper's encoders and decoders as Flax NNX modules.
 
-The modules are used functionally. `init` splits a model once into its definition, parameters and batch statistics, and
-`flax.nnx.merge(graphdef, params, stats, copy=True)` assembles it again inside `jax.jit`.
-
 Images have shape `(batch, height, width, channel)`. Their encoders take values in [0, 1], and their decoders return
 logits. Vectors have shape `(batch, size)`. Their values are not limited.
 
@@ -38,11 +35,7 @@ _FIRST_LOG_VAR = -4.0  # log variance of an active latent at initialisation
 
 @dataclass(frozen=True)
 class Modality:
-    """One quantity that a model receives as an input and predicts as an output: an image or a vector.
-
-    Raises:
-        ValueError: `shape` is not allowed for `kind`, or the grey value `start` is not between 0 and 1.
-    """
+    """One quantity that a model receives as an input and predicts as an output: an image or a vector."""
 
     name: str
     kind: Literal["image", "vector"]
@@ -54,30 +47,19 @@ class Modality:
 
     def __post_init__(self) -> None:
         if not 0 < self.start < 1:
-            raise ValueError(f"modality {self.name!r}: start is {self.start}, but it must be a grey value > 0 and < 1")
-        if self.kind == "vector" and len(self.shape) == 1 and self.shape[0] > 0:
-            return
-        if self.kind == "image" and len(self.shape) == 3:
-            if all(side >= 32 and side % 8 == 0 for side in self.shape[:2]):
-                return
+            raise ValueError(f"modality {self.name!r}: start must be a grey value > 0 and < 1, got {self.start}")
+        image = len(self.shape) == 3 and all(side >= 32 and side % 8 == 0 for side in self.shape[:2])
+        vector = len(self.shape) == 1 and self.shape[0] > 0
+        if not (self.kind == "image" and image) and not (self.kind == "vector" and vector):
             raise ValueError(
-                f"modality {self.name!r}: shape is {self.shape}, but the height and the width of an image must be "
-                "multiples of 8 and >= 32"
+                f"modality {self.name!r} must be an 'image' of shape (height, width, channel) with sides >= 32 that "
+                f"are multiples of 8, or a 'vector' of shape (size,), got {self.kind!r} of shape {self.shape}"
             )
-        raise ValueError(
-            f"modality {self.name!r}: kind is {self.kind!r} and shape is {self.shape}, but the modality must be an "
-            "'image' with the shape (height, width, channel), or a 'vector' with the shape (size,) and size >= 1"
-        )
 
 
 @dataclass(frozen=True)
 class Config:
-    """Configuration of a multimodal variational autoencoder, in values that JSON can represent.
-
-    Raises:
-        ValueError: `modalities` is empty, two modalities have the same name, or `widths` does not have four numbers,
-            one for each convolution.
-    """
+    """Configuration of a multimodal variational autoencoder, in values that JSON can represent."""
 
     modalities: tuple[Modality, ...]
     latent: int = 256  # components of the latent (paper)
@@ -89,22 +71,22 @@ class Config:
     def __post_init__(self) -> None:
         names = [m.name for m in self.modalities]
         if not names or len(set(names)) != len(names):
-            raise ValueError(f"modalities has the names {names}: give at least one modality, and each name once")
+            raise ValueError(f"modalities must have at least one name, and each once, got {names}")
         if len(self.widths) != len(_LAYERS):
-            raise ValueError(f"widths is {self.widths}, but it must have {len(_LAYERS)} numbers, one per convolution")
+            raise ValueError(f"widths must have {len(_LAYERS)} numbers, one per convolution, got {self.widths}")
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of the modalities, in the order of `modalities`."""
+        """The names of the modalities."""
         return tuple(m.name for m in self.modalities)
 
     def to_json(self) -> dict[str, Any]:
-        """The configuration as nested dictionaries and tuples, which `json.dumps` accepts."""
+        """The fields by name, in values that `json.dumps` accepts."""
         return asdict(self)
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> "Config":
-        """Make a configuration from the result of `to_json`, or from the same values read from a JSON file."""
+        """Make a configuration from the result of `to_json`, or from the same values of a JSON file."""
         return storage.decode(cls, values, "model")
 
 
@@ -142,15 +124,10 @@ class _FromLatent(_Linear):
 class BatchNorm(nnx.Module):
     """Batch normalisation with a weight per sample.
 
-    In training, the mean of a channel is `sum_n w_n mean_hw(x_n) / sum_n w_n`, where `w_n` is the weight of sample n
-    and `mean_hw(x_n)` is the mean over the pixels of this sample. The variance is computed in the same way. Each
-    running statistic is then set to `momentum * old + (1 - momentum) * new`, where `new` is the value of the batch. If
-    all weights are 0, the running statistics are used and stay unchanged. Evaluation (`weights=None`) always uses the
-    running statistics.
-
-    Args:
-        channels: Number of channels.
-        momentum: Weight of the old values in the running statistics, from 0 to 1.
+    In training, the mean of a channel is `sum_n w_n mean_hw(x_n) / sum_n w_n`, with the weight `w_n` of sample n and
+    the mean over its pixels, and the variance likewise. Each running statistic becomes `momentum * old + (1 - momentum)
+    * new`. If all weights are 0, the running statistics are used and stay unchanged. Evaluation (`weights=None`) uses
+    the running statistics.
     """
 
     def __init__(self, channels: int, *, momentum: float) -> None:
@@ -163,16 +140,7 @@ class BatchNorm(nnx.Module):
     def __call__(
         self, x: Float[Array, "batch h w channel"], weights: Float[Array, "batch"] | None
     ) -> Float[Array, "batch h w channel"]:
-        """Normalise images channel by channel.
-
-        Args:
-            x: Images.
-            weights: Weight of each sample in the statistics of this batch, which also update the running statistics.
-                None normalises by the running statistics.
-
-        Returns:
-            Normalised images, scaled and shifted by the learnt parameters.
-        """
+        """Normalise images channel by channel, then scale and shift them. `weights` are those of the samples."""
         mean, var = self.mean[...], self.var[...]
         if weights is not None:
             total = jnp.sum(weights)
@@ -271,13 +239,12 @@ class MVAE(nnx.Module):
         self.decoders = nnx.Dict({m.name: decoders[m.kind](m, config) for m in config.modalities})
 
     def encode(self, name: str, x: Array, weights: Array | None) -> Gaussian:
-        """Estimate the latent from one modality. `product_of_experts` combines the estimates of several modalities.
+        """The expert of one modality.
 
         Args:
             name: Name of the modality.
             x: Images in [0, 1] or vectors, `(batch, *shape)`.
-            weights: Weight of each sample in batch normalisation, `(batch,)`. With None, batch normalisation uses the
-                running statistics.
+            weights: Weight of each sample in batch normalisation. None uses the running statistics.
 
         Returns:
             Mean and log variance of the latent, `(batch, latent)`.
@@ -285,35 +252,25 @@ class MVAE(nnx.Module):
         return self.encoders[name](x, weights)
 
     def decode(self, name: str, z: Array, weights: Array | None) -> Array:
-        """Predict one modality from latents.
+        """Predict one modality from latents, to which the condition is appended.
 
         Args:
             name: Name of the modality.
-            z: Latents, `(batch, latent + condition)`. If the model has a condition (known quantities, such as an
-                acceleration), append the numbers of the condition to each latent before the call.
-            weights: Weight of each sample in batch normalisation, `(batch,)`. With None, batch normalisation uses the
-                running statistics.
+            z: Latents, `(batch, latent + condition)`.
+            weights: Weight of each sample in batch normalisation. None uses the running statistics.
 
         Returns:
-            The predictions, `(batch, *shape)`. Images are logits, which `jax.nn.sigmoid` converts to values in [0, 1].
+            The predictions, `(batch, *shape)`. Images are logits.
         """
         return self.decoders[name](z, weights)
 
 
 def init(key: PRNGKeyArray, config: Config) -> tuple[nnx.GraphDef[MVAE], nnx.State, nnx.State]:
-    """Create a model with random parameters.
+    """Create a model with random parameters: its definition, parameters and running batch statistics.
 
     Kernels are drawn from normal distributions with variance `1 / fan_in`, where `fan_in` counts only the active
-    inputs. Only the first 16 components of the latent are active at the start. The weights that belong to the other
-    components are multiplied by 0.03, so that these components start near the prior. The kernel of the last layer of an
-    image decoder is multiplied by 0.1. The biases of hidden layers are 0, and the scales of batch normalisation are 1.
-
-    Args:
-        key: Random key for the kernels.
-        config: Configuration of the model.
-
-    Returns:
-        The definition `graphdef`, the parameters `params` and the running batch statistics `stats`.
+    inputs. Only the first 16 components of the latent are active at the start. The weights of the others are multiplied
+    by 0.03, so that they start near the prior, and the last kernel of an image decoder by 0.1.
     """
     # All kernels are drawn in one call, because every shape of a draw would need a compilation of its own.
     graphdef, params, stats = nnx.split(MVAE(config), nnx.Param, nnx.BatchStat)

@@ -1,124 +1,205 @@
-"""Calibration: numbers that correct the predicted density of the final pose and set the contrast of sampled images.
+"""Fit the `Calibration` of a model to trajectories that its training did not see.
 
-The transition is the network that predicts the density of the final pose. For each outcome, such as resting or falling
-off, the density is a mixture of Gaussians. The encoders estimate the states of training objects better than the states
-of other objects. The transition learns from training objects, and its density is too narrow for other objects. It is
-corrected separately for each combination of inputs, such as the visual image alone or the visual image and the pose.
+The encoders estimate the states of training objects better than the states of other objects. The transition learns
+from training objects, and its density is too narrow for others. It is corrected for each subset of the inputs by three
+temperatures in the sense of Guo et al. (2017), "On Calibration of Modern Neural Networks": an exponent of the
+probabilities of the outcomes, an exponent of the weights of the mixtures, and a factor of the variances. The last two
+can only widen the density of the pose: in a fit to few objects, a narrower density often has the largest likelihood,
+but it covers too few of the true poses of other objects.
 
-Three numbers correct the density: an exponent of the probabilities of the outcomes, an exponent of the weights of the
-mixtures, and a factor of the variances. They are temperatures in the sense of Guo et al.
-(2017), "On Calibration of Modern Neural Networks". The first number can make the probabilities of the outcomes less
-certain or more certain. After a short training, these probabilities are often too uncertain, and the number makes them
-more certain. The other two numbers can only widen the density of the pose. In a fit to few objects, a narrower density
-often has the largest likelihood, but it covers too few of the true poses of other objects.
-
-A fourth number is the contrast of the sampled images. A larger contrast makes their outlines sharper. The gradient
-energy of an image is the sum of the squared differences of neighbouring pixels. The fit chooses the contrast at which
-the gradient energy of the sampled images is nearest to that of the true images.
-
-`statespace.fitting` finds the numbers on trajectories that the training did not see.
+The fourth number is the contrast at which the gradient energy of the sampled images is nearest to that of the true
+images. The gradient energy is the sum of the squared differences of neighbouring pixels.
 """
 
+import functools
+import itertools
+import math
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from flax import nnx
+from jaxtyping import Array, Bool, Float, Int
+from scipy import optimize
 
-from sts_jax.mvae import Gaussian
-from sts_jax.statespace.config import Config
-from sts_jax.statespace.networks import FinalPose, Model
-from sts_jax.statespace.objective import experts, fuse, of_state
+from sts_jax.statespace.networks import CONTRAST, FinalPose, Model, compose
+from sts_jax.statespace.objective import log_density, rotation_between
+from sts_jax.statespace.predict import Calibration, corrected, draw, predict
 
-
-class Calibration(NamedTuple):
-    """Numbers that correct the density of the final pose and set the contrast of sampled images.
-
-    Each array has one value for each subset of the inputs. If `outcome`, `weight` and `variance` are 1, the density is
-    unchanged. A larger `contrast` makes the outlines in sampled images sharper. A subset has the index
-    `sum(2**i for i in members)`, where `members` are the positions of its inputs in `Config.inputs`. For example, the
-    subset of the first and the second input has the index 3.
-    """
-
-    outcome: Float[Array, "subsets"]  # exponent of the probabilities of the outcomes, in [1/4, 4]
-    weight: Float[Array, "subsets"]  # exponent of the weights of an outcome's mixture components, in [1/4, 1]
-    variance: Float[Array, "subsets"]  # factor of the variances of the components, in [1, 4]
-    contrast: Float[Array, "subsets"]  # contrast of the outlines in samples, `compose`
+CONTRASTS = (5.0, 10.0, 20.0, 40.0)  # contrasts of samples that are tried
+_CHUNK = 64  # items in one compiled call
+_SAMPLES = 4  # samples of each item for the choice of the contrast
+_MOST = 128  # largest number of items for the choice of the contrast
+# Bounds of the logarithms of the three numbers. The last two allow a wider density of the pose, and no narrower one.
+_BOUNDS = ((-math.log(4), math.log(4)), (-math.log(4), 0), (0, math.log(4)))
+_PRIOR = 0.5  # standard deviation of the logarithms in the prior, which is a normal distribution about 0
 
 
-def of_items(config: Config, calibration: Calibration, present: dict[str, Bool[Array, "n"]]) -> Calibration:
-    """Select the calibration of each item: the values for the subset of the inputs that the item has.
+class _Chunk(NamedTuple):
+    """Items of one compiled call: the arguments of `predict` between the model and the calibration."""
+
+    inputs: dict[str, np.ndarray]
+    present: dict[str, np.ndarray]
+    empty: dict[str, np.ndarray]
+    condition: np.ndarray | None
+
+
+def fit(
+    graphdef: nnx.GraphDef[Model],
+    params: nnx.State,
+    inputs: dict[str, np.ndarray],
+    targets: dict[str, np.ndarray],
+    empty: dict[str, np.ndarray],
+    *,
+    present: dict[str, np.ndarray] | None = None,
+    condition: np.ndarray | None = None,
+) -> Calibration:
+    """Fit the calibration of a model, by maximum likelihood with a prior that favours values near 1.
 
     Args:
-        config: Configuration of the model.
-        calibration: Values for each subset of the inputs.
-        present: Masks `(n,)` of the inputs by name. True means that the item has the input. An item with the input
-            `state` (the true pose, shape and mass) gets the value 1 for each number that corrects the density of the
-            final pose, so the density stays unchanged.
+        graphdef: Definition of the model, from `init`.
+        params: Parameters of the model.
+        inputs: All inputs of the model by name: images `visual` and `tactile` `(n, size, size, 3)`, uint8 or in [0, 1],
+            and pose codes `pose` `(n, 12)`.
+        targets: `state` has the state codes of the first frames, `pose` the pose codes of the last frames, `outcome`
+            indices into the outcomes of the scenario, `(n,)`, and `visual` the visual images of the last frames,
+            `(n, image_size, image_size, 3)`, uint8 or in [0, 1].
+        empty: `visual` and `tactile` image of the empty sensor, uint8 or in [0, 1].
+        present: Masks `(n,)` of the inputs. An input without a mask is present in all items.
+        condition: From `training.Preprocessing.encode_condition`, or None.
 
     Returns:
-        A `Calibration` whose four arrays, such as `outcome` and `contrast`, have one value for each item, `(n,)`.
+        The calibration. If no item has all inputs of a subset, its first three values are 1, and its contrast is
+        `CONTRAST`.
     """
-    names = enumerate(config.inputs)
-    subset = jnp.asarray(sum(2**i * present[name].astype(int) for i, name in names if name in present))
-    corrected_as = jnp.where(present["state"], 0, subset) if "state" in present else subset
-    density = Calibration(*(x[corrected_as] for x in calibration))
-    return density._replace(contrast=calibration.contrast[subset])
+    names = nnx.merge(graphdef, params).config.inputs
+    number = len(targets["pose"])
+    masks = {name: np.ones(number, bool) for name in names} | (present or {})
+    fitted = np.ones((2 ** len(names), 4))
+    fitted[:, 3] = CONTRAST
+    for members in itertools.product((False, True), repeat=len(names)):
+        chosen = [name for name, member in zip(names, members, strict=True) if member]
+        rows = np.flatnonzero(np.all([masks[name] for name in chosen], axis=0)) if chosen else np.zeros(0, int)
+        if len(rows):
+            final = _densities(graphdef, params, _chunks(inputs, empty, condition, chosen, rows), len(rows))
+            truth = (jnp.asarray(targets[name][rows]) for name in ("state", "pose", "outcome"))
+            numbers = fitted[sum(2 ** names.index(name) for name in chosen)]
+            numbers[:3] = _fitted(final, *truth)
+            some = rows[np.linspace(0, len(rows), min(len(rows), _MOST), endpoint=False).astype(int)]
+            chunks = _chunks(inputs, empty, condition, chosen, some)
+            numbers[3] = _contrast(graphdef, params, chunks, targets["visual"][some], numbers[:3])
+    return Calibration(*jnp.asarray(fitted.T, jnp.float32))
 
 
-def predict(
-    model: Model,
+def _contrast(
+    graphdef: nnx.GraphDef[Model],
+    params: nnx.State,
+    chunks: Iterable[_Chunk],
+    target: np.ndarray,
+    numbers: np.ndarray,
+) -> float:
+    """Find the contrast at which the gradient energy of samples is nearest to that of the true images `target`.
+
+    `numbers` are the first three numbers of the calibration for the inputs of the chunks.
+    """
+    true = np.array(gradient_energy(jnp.asarray(_unit(target))))
+    subsets = 2 ** len(nnx.merge(graphdef, params).config.inputs)
+    correction = Calibration(*(jnp.full(subsets, x, jnp.float32) for x in (*numbers, CONTRAST)))
+    parts = [_energies(graphdef, params, *chunk, correction) for chunk in chunks]
+    energies = np.concatenate(parts, axis=1)[:, : len(target)].mean(1)
+    if true.sum() == 0 or not (energies > 0).all():
+        return CONTRAST
+    return CONTRASTS[np.argmin(np.abs(np.log(energies / true.mean())))]
+
+
+def gradient_energy(images: Float[Array, "*n h w 3"]) -> Float[Array, "*n"]:
+    """The gradient energy of each image: the sum of the squared differences of neighbouring pixels."""
+    down, across = (jnp.diff(images, axis=axis) for axis in (-3, -2))
+    return jnp.sum(down**2, axis=(-3, -2, -1)) + jnp.sum(across**2, axis=(-3, -2, -1))
+
+
+@functools.partial(jax.jit, static_argnames="graphdef")
+def _energies(
+    graphdef: nnx.GraphDef[Model],
+    params: nnx.State,
     inputs: dict[str, Array],
     present: dict[str, Bool[Array, "n"]],
     empty: dict[str, Float[Array, "size size 3"]],
-    condition: Float[Array, "n c"] | None = None,
-    calibration: Calibration | None = None,
-) -> tuple[Gaussian, FinalPose]:
-    """Infer the state and the appearance in the first frame, and predict the density of the final pose.
-
-    Args:
-        model: The networks.
-        inputs: One or more inputs of n items, by name: images `visual` and `tactile` `(n, size, size, 3)` in [0, 1],
-            pose codes `pose` `(n, 12)` and true state codes `state` `(n, code)`.
-        present: A mask for each name in `inputs`, `(n,)`. True means that the item has the input.
-        empty: `visual` and `tactile` image of the empty sensor, in [0, 1].
-        condition: Known quantities of the scenario such as an acceleration, `(n, c)`, from
-            `training.Preprocessing.encode_condition`. None if the model has no condition.
-        calibration: Numbers that correct the density. With None, no density is corrected. If an item has the input
-            `state`, its density is never corrected.
-
-    Returns:
-        The posterior in the first frame, `(n, code + look)`, and the density of the final pose. The posterior is a
-        Gaussian over the state code (pose, shape and mass) and the appearance code (all other visible properties).
-    """
-    belief = fuse(experts(model, inputs, present, empty), present)
-    final = model.transition(of_state(belief), condition)
-    if calibration is None:
-        return belief, final
-    own = of_items(model.config, calibration, present)
-    return belief, corrected(final, own.outcome, own.weight, own.variance)
+    condition: Float[Array, "n c"] | None,
+    correction: Calibration,
+) -> Float[Array, "contrasts n"]:
+    """Mean gradient energy of the samples of each item, for each of the contrasts."""
+    model, key = nnx.merge(graphdef, params), jax.random.key(0)
+    samples = draw(model, key, inputs, present, empty, condition, correction, num=_SAMPLES, drawn=_SAMPLES)
+    energies = [
+        gradient_energy(compose(samples.layers, samples.empty, samples.level, contrast)["visual"])
+        for contrast in CONTRASTS
+    ]
+    return jnp.stack(energies).reshape(len(CONTRASTS), _SAMPLES, -1).mean(1)
 
 
-def corrected(
-    final: FinalPose, outcome: Float[Array, "*n"], weight: Float[Array, "*n"], variance: Float[Array, "*n"]
+def _densities(graphdef: nnx.GraphDef[Model], params: nnx.State, chunks: Iterable[_Chunk], number: int) -> FinalPose:
+    """Predict the densities of the first `number` items of the chunks."""
+    parts = [_density(graphdef, params, *chunk) for chunk in chunks]
+    return jax.tree.map(lambda *x: jnp.concatenate(x)[:number], *parts)
+
+
+def _chunks(
+    inputs: dict[str, np.ndarray],
+    empty: dict[str, np.ndarray],
+    condition: np.ndarray | None,
+    chosen: list[str],
+    rows: np.ndarray,
+) -> Iterator[_Chunk]:
+    """Divide items into chunks of one size, with the inputs `chosen`. Copies of items complete the last one."""
+    present = {name: np.full(_CHUNK, name in chosen) for name in inputs}
+    shown = {name: _unit(image) for name, image in empty.items()}
+    for start in range(0, len(rows), _CHUNK):
+        some = rows[np.arange(start, start + _CHUNK) % len(rows)]
+        given = {name: _unit(values[some]) for name, values in inputs.items()}
+        yield _Chunk(given, present, shown, None if condition is None else condition[some])
+
+
+@functools.partial(jax.jit, static_argnames="graphdef")
+def _density(
+    graphdef: nnx.GraphDef[Model],
+    params: nnx.State,
+    inputs: dict[str, Array],
+    present: dict[str, Bool[Array, "n"]],
+    empty: dict[str, Float[Array, "size size 3"]],
+    condition: Float[Array, "n c"] | None,
 ) -> FinalPose:
-    """Correct the predicted densities of the final pose with the numbers of a `Calibration`.
+    return predict(nnx.merge(graphdef, params), inputs, present, empty, condition)[1]
 
-    Args:
-        final: Densities of n items.
-        outcome: Exponent of the probabilities of the outcomes: a scalar for all items, or `(n,)`.
-        weight: Exponent of the weights of the mixture components: a scalar for all items, or `(n,)`.
-        variance: Factor of the variances of the components: a scalar for all items, or `(n,)`.
 
-    Returns:
-        The corrected densities.
-    """
+def _unit(values: np.ndarray) -> np.ndarray:
+    """Convert uint8 images to float32 in [0, 1]. Other arrays are returned as they are."""
+    return values.astype(np.float32) / 255 if values.dtype == np.uint8 else values
 
-    def power(log: Array, exponent: Array) -> Array:
-        return jax.nn.log_softmax(log * exponent.reshape(-1, *(1,) * (log.ndim - 1)))
 
-    return final._replace(
-        outcome=power(final.outcome, outcome),
-        weight=power(final.weight, weight),
-        log_var=final.log_var + jnp.log(variance).reshape(-1, 1, 1, 1),
-    )
+def _fitted(
+    final: FinalPose, code: Float[Array, "n code"], pose: Float[Array, "n 12"], outcome: Int[Array, "n"]
+) -> np.ndarray:
+    """Fit the three numbers of one subset."""
+
+    def evaluated(log: np.ndarray) -> tuple[float, np.ndarray]:
+        value, slope = _nats(jnp.asarray(log, jnp.float32), final, code, pose, outcome)
+        return float(value), np.asarray(slope, np.float64)
+
+    return np.exp(optimize.minimize(evaluated, np.zeros(3), jac=True, bounds=_BOUNDS).x)
+
+
+@jax.jit
+@jax.value_and_grad
+def _nats(
+    log: Float[Array, "3"],
+    final: FinalPose,
+    code: Float[Array, "n code"],
+    pose: Float[Array, "n 12"],
+    outcome: Int[Array, "n"],
+) -> Float[Array, ""]:
+    """Negative log posterior density of the three numbers, up to a constant. `log` has their logarithms."""
+    given, density = log_density(corrected(final, *jnp.exp(log)), pose, rotation_between(code, pose), outcome)
+    return jnp.sum((log / _PRIOR) ** 2) / 2 - jnp.sum(given) - jnp.sum(density)

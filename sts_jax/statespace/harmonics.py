@@ -15,10 +15,7 @@ from jaxtyping import Array, Float
 
 
 def number(degree: int) -> int:
-    """The number of spherical harmonics of the degrees 0 to `degree`.
-
-    A function on the sphere that is a sum of these harmonics has one coefficient for each harmonic.
-    """
+    """The number of spherical harmonics of the degrees 0 to `degree`."""
     return (degree + 1) ** 2
 
 
@@ -28,10 +25,6 @@ def basis(direction: Float[Array, "*n 3"], degree: int) -> Float[Array, "*n k"]:
     Args:
         direction: Unit vectors. If a vector has another length s, the values of degree n are multiplied by `s**n`.
         degree: Largest degree.
-
-    Returns:
-        Values of the k harmonics at each direction. They are sorted by degree n = 0, 1, 2, ..., and within a degree by
-        order m = 0, 1, -1, ..., n, -n.
     """
     x, y, z = direction[..., 0], direction[..., 1], direction[..., 2]
     square = x**2 + y**2 + z**2
@@ -45,57 +38,36 @@ def basis(direction: Float[Array, "*n 3"], degree: int) -> Float[Array, "*n k"]:
         for n in range(m + 1, degree + 1):
             before = polar.get((n - 2, m), jnp.zeros_like(x))
             polar[n, m] = ((2 * n - 1) * z * polar[n - 1, m] - (n + m - 1) * square * before) / (n - m)
-    found = []
+    harmonics = []
     for n, m in _orders(degree):
         scale = math.sqrt((2 - (m == 0)) * (2 * n + 1) * math.factorial(n - abs(m)) / math.factorial(n + abs(m)))
-        found.append(scale * polar[n, abs(m)] * (cosine[m] if m >= 0 else sine[-m]))
-    return jnp.stack(found, axis=-1)
+        harmonics.append(scale * polar[n, abs(m)] * (cosine[m] if m >= 0 else sine[-m]))
+    return jnp.stack(harmonics, axis=-1)
 
 
 def values(
     coefficients: Float[Array, "n c k"], rotation: Float[Array, "n 3 3"], directions: Float[np.ndarray, "j 3"]
 ) -> Float[Array, "n c j"]:
-    """Rotate functions on the unit sphere, and evaluate the rotated functions at fixed directions.
+    """Rotate c functions of each of n objects, and evaluate them at j fixed directions: `f(R^T d)`.
 
     Args:
-        coefficients: Coefficients of k spherical harmonics, for c functions of each of n objects.
-        rotation: Rotation matrix R of each object. The rotation turns a function f into the function with the value
-            `f(R^T d)` at the direction d. If R is a mean of several rotation matrices, the result is approximately the
-            mean of the results for these matrices.
-        directions: Unit vectors.
-
-    Returns:
-        Values of the rotated functions at the given directions.
+        coefficients: Coefficients of k spherical harmonics.
+        rotation: Rotation matrices R. For a mean of several matrices, the result is approximately the mean of the
+            results.
+        directions: Unit vectors d.
     """
     degree = math.isqrt(coefficients.shape[-1]) - 1
     return jnp.einsum("nck,njk->ncj", coefficients, basis(jnp.asarray(directions) @ rotation, degree))
 
 
 def turn(angle: Float[Array, "n 2"], coefficients: Float[Array, "n c k"]) -> Float[Array, "n c k"]:
-    """Rotate functions on the unit sphere about the z axis.
-
-    Args:
-        angle: Cosine and sine of the rotation angle of each object.
-        coefficients: Coefficients of k spherical harmonics, for c functions of each of n objects.
-
-    Returns:
-        Coefficients of the rotated functions.
-    """
+    """Rotate functions about the z axis. `angle` has the cosine and the sine of each rotation angle."""
     cosine, sine, partner = _about_vertical(angle, coefficients.shape[-1])
     return cosine * coefficients + sine * coefficients[..., partner]
 
 
 def turn_variance(angle: Float[Array, "n 2"], variance: Float[Array, "n c k"]) -> Float[Array, "n c k"]:
-    """Compute the variances of spherical harmonic coefficients after a rotation about the z axis.
-
-    Args:
-        angle: Cosine and sine of the rotation angle of each object.
-        variance: Variances of the k coefficients, for c functions of each of n objects. The harmonics are those of
-            `basis`, in the same order. The coefficients are assumed to be independent.
-
-    Returns:
-        Variances of the coefficients of the rotated functions. Covariances, which the rotation causes, are left out.
-    """
+    """Variances of coefficients after `turn`, if they are independent before. Covariances are left out."""
     cosine, sine, partner = _about_vertical(angle, variance.shape[-1])
     return cosine**2 * variance + sine**2 * variance[..., partner]
 
@@ -108,10 +80,7 @@ def _orders(degree: int) -> list[tuple[int, int]]:
 def _about_vertical(angle: Float[Array, "n 2"], count: int) -> tuple[Array, Array, np.ndarray]:
     """The terms of a rotation about the z axis: `cosine * coefficients + sine * coefficients[..., partner]`.
 
-    The partner of a coefficient has the same degree and the opposite order.
-
-    Returns:
-        `cosine` and `sine`, (n, 1, k), and the indices `partner`, (k,).
+    The partner of a coefficient has the same degree and the opposite order. `cosine` and `sine` are (n, 1, k).
     """
     orders = _orders(math.isqrt(count) - 1)
     partner = np.array([orders.index((n, -m)) for n, m in orders])

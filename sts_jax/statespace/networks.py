@@ -1,14 +1,11 @@
 """Encoders, transition and decoder of the state-space model as Flax NNX modules.
 
-The latent describes an object in the first frame of a trajectory. It has two parts. The state code describes the pose,
-the shape and the mass (`statespace.state`). The appearance code, which the program calls `look`, describes all other
-properties that the images show.
-
-- An encoder for each kind of image (visual and tactile) returns a Gaussian over both codes. The belief is the product
-  of the prior and the Gaussians of all inputs (`objective.fuse`).
-- The transition maps the belief about the state code to a density of the final pose and of the rotation from the first
-  to the final pose. The known quantities of the trajectory (its condition) are a second input.
+- An encoder for each kind of image (visual and tactile) returns a Gaussian over the state code and the appearance code,
+  which the program calls `look`. The belief is the product of the prior and the Gaussians of all inputs (`fuse`).
+- The transition maps the belief about the state code and the condition to a density of the final pose and of the
+  rotation from the first to the final pose.
 - The decoder renders both images of an object in a given pose, from the latent and the rotation since the first frame.
+  `compose` adds the images of the empty sensor.
 
 All convolutions have stride 1, for which XLA's CPU backend is fast. To reduce an image, blocks of pixels are folded
 into channels. To enlarge an image, channels are unfolded into blocks of pixels.
@@ -19,15 +16,16 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from flax import nnx
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from sts_jax import objects
-from sts_jax.mvae import Gaussian
+from sts_jax.mvae import Gaussian, product_of_experts
 from sts_jax.statespace import harmonics, poses, state, window
 from sts_jax.statespace.config import IMAGES, TINT, Config
-from sts_jax.statespace.layers import Layers
 
 UNKNOWN_LOG_VAR = 30.0  # log variance of numbers that an input does not determine: their precision is almost 0
+EXACT_LOG_VAR = -9.2  # log variance of a pose that is an input: 0.5 mm for a position scale of 50 mm
+CONTRAST = 40.0  # contrast of samples without a calibration, see `compose`
 _LOG_VAR_LIMIT = 8.0  # largest absolute value of an encoder's log variances
 _FINAL_LOG_VAR = (-3.0, 5.0)  # range of the log variances of the final pose: its centre and half of its width
 _OUTSIDE = 8.0  # difference of the logit of being covered by the object, between inside and outside of the canvas
@@ -41,12 +39,11 @@ _SMALL = nnx.initializers.variance_scaling(0.1, "fan_in", "normal")  # for last 
 
 
 class FinalPose(NamedTuple):
-    """The predicted density of the final pose of n objects.
+    """The predicted density of the final pose of n objects: for each outcome, a mixture of k Gaussians over 21 numbers.
 
-    For each outcome of the scenario, such as resting or falling off, the density is a mixture of k Gaussians over 21
-    numbers. The first 12 numbers are the final pose code (position and rotation matrix, see `statespace.poses`). The
-    other 9 are the matrix of the rotation from the first to the final pose, row by row. All numbers refer to a frame
-    that has the origin and the z axis of the sensor frame, and an x axis along `heading`.
+    The first 12 numbers are the final pose code. The other 9 are the matrix of the rotation from the first to the final
+    pose, row by row. All refer to a frame with the origin and the z axis of the sensor frame, and an x axis along
+    `heading`.
     """
 
     outcome: Float[Array, "n outcomes"]  # log probability of each outcome
@@ -54,6 +51,47 @@ class FinalPose(NamedTuple):
     mean: Float[Array, "n outcomes k 21"]  # mean of each component
     log_var: Float[Array, "n outcomes k 21"]  # log variances of each component
     heading: Float[Array, "n 2"]  # cosine and sine of the angle from the sensor's x axis, see `state.heading`
+
+
+class Layers(NamedTuple):
+    """Outlines and colours of n rendered objects, and the changes that the objects cause in the tactile images."""
+
+    covered: Float[Array, "n size size 1"]  # logit of the probability that a pixel shows the object
+    colour: Float[Array, "n size size 3"]  # colour of the object, [0, 1]
+    touch: Float[Array, "n size size 3"]  # change of the logits of the tactile image
+
+
+def compose(
+    layers: Layers,
+    empty: dict[str, Float[Array, "size size 3"]],
+    level: Float[Array, "n"] | None = None,
+    contrast: float | Float[Array, "n"] = CONTRAST,
+) -> dict[str, Float[Array, "n size size 3"]]:
+    """Combine the rendered objects with the images of the empty sensor, of the same size.
+
+    Let p be the probability that the object covers a pixel. The weight of the object's colour is p, or with thresholds
+    `sigmoid(contrast * (logit(p) - logit(level)))`, which gives sharp outlines. If the threshold is drawn uniformly, a
+    pixel shows the object with the probability p.
+
+    Args:
+        layers: From the decoder.
+        empty: `visual` and `tactile` image of the empty sensor in [0, 1].
+        level: Threshold for each object, from 0 to 1, or None.
+        contrast: Sharpness of the outlines if there is a threshold.
+
+    Returns:
+        The images `visual` and `tactile` of each object, in [0, 1].
+    """
+    logit = layers.covered
+    if level is not None:
+        level = jnp.clip(level, 0.01, 0.99).reshape(-1, 1, 1, 1)
+        logit = jnp.reshape(contrast, (-1, 1, 1, 1)) * (logit - jnp.log(level / (1 - level)))
+    covered = jax.nn.sigmoid(logit)
+    grey = jnp.clip(empty["tactile"], 0.01, 0.99)
+    return {
+        "visual": covered * layers.colour + (1 - covered) * empty["visual"],
+        "tactile": jax.nn.sigmoid(jnp.log(grey / (1 - grey)) + layers.touch),
+    }
 
 
 class _Residual(nnx.Module):
@@ -80,21 +118,11 @@ class _ResidualDense(nnx.Module):
 
 
 def parts(config: Config, look: Float[Array, "n look"]) -> tuple[Array, Array, Array]:
-    """Split appearance codes into traits and functions on the unit sphere.
-
-    Traits are numbers that do not depend on the object's rotation. A function assigns a number to each direction, and
-    rotates with the object. Some functions are expressed in the mesh frame, and their coefficients do not depend on the
-    rotation of the object. The other functions are expressed in the sensor frame, and their coefficients change when
-    the object rotates.
-
-    Args:
-        config: Configuration of the model. It defines the number of traits (`traits`), the number of functions in the
-            mesh frame (`own`), and the number of functions in the sensor frame (`shown`).
-        look: Appearance codes of n items.
+    """Split appearance codes into traits and coefficients of functions on the unit sphere.
 
     Returns:
-        Three arrays. The first has the traits, `(n, traits)`. The others have k spherical harmonic coefficients of each
-        function: `(n, own, k)` in the mesh frame and `(n, shown, k)` in the sensor frame.
+        Traits, which do not depend on the object's rotation, `(n, traits)`. Coefficients of the functions of directions
+        in the mesh frame, `(n, own, k)`, and in the sensor frame, `(n, shown, k)`.
     """
     count = harmonics.number(config.degree)
     traits, own, shown = jnp.split(look, [config.traits, config.traits + config.own * count], axis=-1)
@@ -104,11 +132,11 @@ def parts(config: Config, look: Float[Array, "n look"]) -> tuple[Array, Array, A
 def _shape(
     config: Config, known: state.State, own_turn: Float[Array, "n 3 3"], shown_turn: Float[Array, "n 3 3"]
 ) -> list[Array]:
-    """Values of the support functions `own` and `shown` at fixed directions, after one rotation each."""
+    """Values of the support functions in both frames at fixed directions, after one rotation each."""
     directions = objects.lattice(config.support)
     return [
-        harmonics.values(known.own[:, None], own_turn, directions),
-        harmonics.values(known.shown[:, None], shown_turn, directions),
+        harmonics.values(known.support[:, None], own_turn, directions),
+        harmonics.values(known.support_in_sensor[:, None], shown_turn, directions),
     ]
 
 
@@ -139,11 +167,9 @@ def _unfold(x: Float[Array, "n h w c"]) -> Float[Array, "n 2*h 2*w c//4"]:
 
 
 class Encoder(nnx.Module):
-    """Estimates the state code (pose, shape and mass) and the appearance code from a visual or from a tactile image.
+    """Estimates the state code and the appearance code from a visual or from a tactile image.
 
-    The appearance code describes all visible properties of the object other than its pose and shape. The first three
-    numbers of this code are the tint, which describes the mean colour of the object. In a visual image, the tint is
-    measured from the pixels. A tactile image does not determine the tint.
+    In a visual image, the tint is measured from the pixels. A tactile image does not determine it.
     """
 
     def __init__(self, config: Config, name: str, rngs: nnx.Rngs) -> None:
@@ -163,13 +189,10 @@ class Encoder(nnx.Module):
         self.last = nnx.Linear(config.hidden, 2 * (state.CODE + config.look), kernel_init=_SMALL, rngs=rngs)
 
     def __call__(self, change: Float[Array, "n size size 3"]) -> Gaussian:
-        """Estimate the codes of each image.
+        """Estimate the codes of each image: a Gaussian `(n, code + look)`.
 
         Args:
             change: Images minus the image of the empty sensor, both in [0, 1].
-
-        Returns:
-            A Gaussian over the state code and the appearance code, `(n, code + look)`.
         """
         config = self.config
         place = window.locate(jax.lax.stop_gradient(change))
@@ -195,10 +218,10 @@ class Encoder(nnx.Module):
         tint, doubt_of_tint = self._tint(change)
         traits = traits.at[:, :TINT].set(tint)
         blur = (blur[0].at[:, :TINT].set(jnp.exp(doubt_of_tint)), *blur[1:])
-        found = state.turn(place.angle, state.split(mean[:, : state.CODE]))
+        turned = state.turn(place.angle, state.split(mean[:, : state.CODE]))
         doubt = state.turn_variance(place.angle, state.split(variance[:, : state.CODE]))
         return Gaussian(
-            _joined(*found, traits, own, harmonics.turn(place.angle, shown)),
+            _joined(*turned, traits, own, harmonics.turn(place.angle, shown)),
             jnp.log(_joined(*doubt, *blur[:2], harmonics.turn_variance(place.angle, blur[2]))),
         )
 
@@ -214,8 +237,8 @@ class Encoder(nnx.Module):
 class Transition(nnx.Module):
     """Predicts the density of the final pose from the state in the first frame.
 
-    The input is a belief: a Gaussian over the state code (pose, shape and mass). The appearance code is not an input.
-    Otherwise, the transition would recognise training objects by their appearance (see docs/trials.md).
+    The appearance code is not an input. Otherwise, the transition would recognise training objects by their appearance
+    (see docs/trials.md).
     """
 
     def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
@@ -229,15 +252,11 @@ class Transition(nnx.Module):
         self.mixture = nnx.Linear(config.transition, components, kernel_init=_SMALL, rngs=rngs)
 
     def __call__(self, belief: Gaussian, condition: Float[Array, "n c"] | None) -> FinalPose:
-        """Predict the density of the final pose.
+        """Predict the density of the final pose, in a frame whose x axis is the heading of the mean state.
 
         Args:
-            belief: Posterior of the state code, `(n, code)`.
-            condition: Known quantities of the scenario such as an acceleration, from
-                `training.Preprocessing.encode_condition`. None if the scenario has no condition.
-
-        Returns:
-            The density, in a coordinate frame whose x axis is the heading of the mean state.
+            belief: Belief about the state code, `(n, code)`.
+            condition: From `training.Preprocessing.encode_condition`, or None.
         """
         config = self.config
         known = state.split(belief.mean)
@@ -249,7 +268,7 @@ class Transition(nnx.Module):
             here,
             *_shape(config, known, poses.matrix(here), level),
             jnp.einsum("nij,nj->ni", poses.matrix(here), known.com),
-            jnp.einsum("nij,nj->ni", level, known.low),
+            jnp.einsum("nij,nj->ni", level, known.com_in_sensor),
             known.mass,
             state.split(doubt).pose,
             *(jnp.mean(part, axis=-1, keepdims=True) for part in state.split(doubt)[1:]),
@@ -278,13 +297,9 @@ class Transition(nnx.Module):
 class Decoder(nnx.Module):
     """Renders an object in a given pose, from its shape and its appearance code.
 
-    The shape is a part of the state code, a vector that describes the object's pose, shape and mass. The appearance
-    code describes all other visible properties.
-
     The network renders the object on a canvas: a square that is parallel to the pad and aligned with the object's
-    heading. The heading is a direction parallel to the pad, and it turns with the object. The centre of the canvas is
-    below the mesh origin, at the height of the object's lowest point, because the camera sees the object from below.
-    The canvas is then projected into the view of the camera. `compose` adds the images of the empty sensor.
+    heading. Its centre is below the mesh origin, at the height of the object's lowest point, because the camera sees
+    the object from below. The canvas is then projected into the view of the camera.
     """
 
     def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
@@ -313,9 +328,6 @@ class Decoder(nnx.Module):
             turn: Rotation matrices from the first frame to the frame to render.
             known: State codes of the first frame. Only the shapes are used.
             look: Appearance codes of the first frame.
-
-        Returns:
-            The outline, the colour and the change of the tactile image of each object.
         """
         config = self.config
         heading = poses.heading(pose)
@@ -342,17 +354,7 @@ class Decoder(nnx.Module):
 def _on_canvas(
     config: Config, pose: Float[Array, "n 12"], heading: Float[Array, "n 2"], depth: Float[Array, "n"]
 ) -> Float[Array, "n m 2"]:
-    """Find the place on the canvas that each pixel of the view shows.
-
-    Args:
-        config: Configuration of the model.
-        pose: Pose codes.
-        heading: Cosine and sine of the angle from the x axis to the heading of each object.
-        depth: Distances of the canvases from the pinhole along the optical axis (m).
-
-    Returns:
-        Column and row on the canvas for each of m pixels. Whole numbers are pixel centres.
-    """
+    """Column and row on the canvas that each of m pixels of the view shows. Whole numbers are pixel centres."""
     position = pose[:, :2] * config.position_scale
     shrunk = (config.camera_distance / depth)[:, None]
     place = ((jnp.arange(config.image_size) + 0.5) / config.image_size - 0.5) * config.view
@@ -362,7 +364,7 @@ def _on_canvas(
 
 
 class Model(nnx.Module):
-    """The networks of a state-space model: a transition, a decoder, and an encoder for each kind of input image."""
+    """The networks of a state-space model."""
 
     def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
         self.config = config
@@ -372,16 +374,7 @@ class Model(nnx.Module):
 
 
 def init(key: PRNGKeyArray, config: Config) -> tuple[nnx.GraphDef[Model], nnx.State, nnx.State]:
-    """Create a model with random parameters.
-
-    Args:
-        key: Random key for the parameters.
-        config: Configuration of the model.
-
-    Returns:
-        The definition `graphdef`, the parameters `params`, and the state `stats`. This state is empty, because the
-        model has no running batch statistics.
-    """
+    """Create a model with random parameters: its definition, its parameters, and an empty state of batch statistics."""
 
     @jax.jit
     def draw(key: PRNGKeyArray) -> nnx.State:
@@ -390,3 +383,53 @@ def init(key: PRNGKeyArray, config: Config) -> tuple[nnx.GraphDef[Model], nnx.St
     abstract = nnx.eval_shape(lambda: Model(config, nnx.Rngs(0)))
     graphdef, _, stats = nnx.split(abstract, nnx.Param, ...)
     return graphdef, draw(key), stats
+
+
+def experts(
+    model: Model,
+    inputs: dict[str, Array],
+    counts: dict[str, Bool[Array, "n"]],
+    empty: dict[str, Float[Array, "size size 3"]],
+) -> dict[str, Gaussian]:
+    """The expert of each input alone, `(n, code + look)`, by name of the input.
+
+    Args:
+        model: The networks.
+        inputs: Images `visual` and `tactile` `(n, size, size, 3)` in [0, 1], pose codes `pose` `(n, 12)` and, if they
+            are known, state codes `state` `(n, code)`.
+        counts: A mask for each name in `inputs`. Values of items whose mask is False have no influence and may be NaN.
+        empty: `visual` and `tactile` image of the empty sensor in [0, 1], of the same size as the inputs.
+    """
+    # Masked items are set to zero before the networks, because 0 * NaN would make the product and its gradient NaN.
+    change = {name: counted(counts[name], inputs[name] - empty[name]) for name in IMAGES if name in inputs}
+    estimates = {name: model.encoders[name](x) for name, x in change.items()}
+    for name in ("pose", "state"):
+        if name in inputs:
+            code = counted(counts[name], inputs[name])
+            nothing = jnp.zeros((len(code), state.CODE - code.shape[1] + model.config.look))
+            log_var = [jnp.full_like(code, EXACT_LOG_VAR), nothing + UNKNOWN_LOG_VAR]
+            estimates[name] = Gaussian(jnp.concatenate([code, nothing], axis=-1), jnp.concatenate(log_var, axis=-1))
+    return estimates
+
+
+def fuse(estimates: dict[str, Gaussian], counts: dict[str, Bool[Array, "n"]]) -> Gaussian:
+    """The belief of each item: the normalised product of the prior and the experts that count."""
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *estimates.values())
+    return product_of_experts(stacked, jnp.stack([counts[name] for name in estimates]))
+
+
+def of_state(belief: Gaussian) -> Gaussian:
+    """Marginal of the belief over the state code."""
+    return Gaussian(belief.mean[:, : state.CODE], belief.log_var[:, : state.CODE])
+
+
+def counted(counts: Bool[Array, "n"], values: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+    """Set the values of masked items to zero."""
+    return jnp.where(counts.reshape(-1, *(1,) * (values.ndim - 1)), values, 0)
+
+
+def reduced(images: Float[Array, "*n h w c"], size: int) -> Float[Array, "*n size size c"]:
+    """Reduce images to `size` x `size` pixels by averaging over blocks. `size` must divide their height and width."""
+    *lead, height, width, channels = images.shape
+    blocks = images.reshape(*lead, size, height // size, size, width // size, channels)
+    return jnp.mean(blocks, axis=(-4, -2))

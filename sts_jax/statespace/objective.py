@@ -1,17 +1,9 @@
-"""The loss of a state-space model.
-
-A batch has the first and the last frames of some trajectories. The inputs are from the first frame. The targets
-are the true state in the first frame, and the images, the pose and the outcome of the last frame. The state code is a
-vector that describes the pose, the shape and the mass of the object. The appearance code describes all other visible
-properties. Each input gives a Gaussian estimate of both codes. `fuse` multiplies the estimates from some of the inputs.
-The product is a Gaussian over both codes, which is called the belief from these inputs. NLL is a
-negative log likelihood. The loss is the weighted sum of these terms:
+"""The loss of a state-space model: a weighted sum of these terms (NLL is a negative log likelihood).
 
 - `state` and `doubt`: the squared error of the state code that each encoder estimates, and the NLL by which the encoder
   learns the variance of this error
 - `outcome` and `pose`: the NLL of the true outcome, and the NLL of the true final pose and of the rotation from the
-  first to the final pose. The transition network predicts all three from the state code of a belief. Each NLL is a
-  mean over the beliefs from all non-empty subsets of the inputs
+  first to the final pose. Each is a mean over the beliefs from all non-empty subsets of the inputs
 - `visual` and `tactile`: the cross-entropy of the rendered images of the last frame, minus the entropy of the targets.
   `visual` is a sum over the pixels that show the object. `tactile` is a sum over all pixels
 - `first`: the sum of the terms `visual` and `tactile`, but computed for the input images of the first frame
@@ -19,13 +11,12 @@ negative log likelihood. The loss is the weighted sum of these terms:
 - `look`: the divergence of the appearance code from its prior, multiplied by `beta` in the loss
 
 The decoder renders the object in its true pose in each of the two frames. It therefore never learns a mean of images
-for several possible poses. For each item of the batch, a random subset of its inputs is chosen. It contains at least
-one image. The decoder receives an appearance code that is drawn from the belief from this subset.
+for several possible poses. Its appearance code is drawn from the belief from a random subset of the inputs with at
+least one image.
 
-Two further kinds of data contribute to some of the terms. *Views* are first frames without a trajectory. Views
-contribute to `state` and `doubt`. In `first` and `covered`, views replace the first frames of the trajectories. *Falls*
-are trajectories without images. Falls contribute to `outcome` and `pose`. The belief of a fall is made from the true
-state. In every second fall, noise is added to the shape and the mass.
+Views contribute to `state` and `doubt`. In `first` and `covered`, they replace the first frames of the trajectories.
+Falls contribute to `outcome` and `pose`. The belief of a fall is made from the true state. In every second fall, noise
+is added to the shape and the mass.
 """
 
 import itertools
@@ -38,98 +29,32 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from sts_jax.mvae import Gaussian, kl_standard_normal, product_of_experts
+from sts_jax.mvae import Gaussian, kl_standard_normal
 from sts_jax.statespace import poses, state, window
 from sts_jax.statespace.config import IMAGES, TINT, LossWeights
-from sts_jax.statespace.layers import compose
-from sts_jax.statespace.networks import UNKNOWN_LOG_VAR, FinalPose, Model
+from sts_jax.statespace.networks import (
+    EXACT_LOG_VAR,
+    FinalPose,
+    Model,
+    compose,
+    counted,
+    experts,
+    fuse,
+    of_state,
+    reduced,
+)
 
-EXACT_LOG_VAR = -9.2  # log variance of a pose that is an input: 0.5 mm for a position scale of 50 mm
 _LEAST = 1 / 1020  # rendered images are clipped to this distance from 0 and 1
-
-
-def experts(
-    model: Model,
-    inputs: dict[str, Array],
-    counts: dict[str, Bool[Array, "n"]],
-    empty: dict[str, Float[Array, "size size 3"]],
-) -> dict[str, Gaussian]:
-    """Estimate the state code and the appearance code from each input alone.
-
-    Each estimate is a Gaussian, which is called the expert of the input. The state code describes pose, shape and mass,
-    and the appearance code describes all other visible properties.
-
-    Args:
-        model: The networks.
-        inputs: Inputs by name: images `visual` and `tactile` `(n, size, size, 3)` in [0, 1], pose codes `pose`
-            `(n, 12)` and, if they are known, true state codes `state` `(n, code)`.
-        counts: A mask for each name in `inputs`, `(n,)`. True means that the item has the input. Values of other items
-            have no influence and may be NaN.
-        empty: `visual` and `tactile` image of the empty sensor in [0, 1], of the same size as the inputs.
-
-    Returns:
-        The experts by name of the input, each of shape `(n, code + look)`. `code` is the length of the state code, and
-        `look` is the length of the appearance code. The expert of the input `pose` has a very large variance for all
-        numbers except the pose, and the expert of the input `state` for all numbers of the appearance code.
-    """
-    # Masked items are set to zero before the networks, because 0 * NaN would make the product and its gradient NaN.
-    change = {name: _counted(counts[name], inputs[name] - empty[name]) for name in IMAGES if name in inputs}
-    found = {name: model.encoders[name](x) for name, x in change.items()}
-    for name in ("pose", "state"):
-        if name in inputs:
-            code = _counted(counts[name], inputs[name])
-            nothing = jnp.zeros((len(code), state.CODE - code.shape[1] + model.config.look))
-            log_var = [jnp.full_like(code, EXACT_LOG_VAR), nothing + UNKNOWN_LOG_VAR]
-            found[name] = Gaussian(jnp.concatenate([code, nothing], axis=-1), jnp.concatenate(log_var, axis=-1))
-    return found
-
-
-def fuse(found: dict[str, Gaussian], counts: dict[str, Bool[Array, "n"]]) -> Gaussian:
-    """Combine the estimates from all inputs of each item into one Gaussian, which is called the belief.
-
-    The belief is the normalised product of the standard normal prior and the estimates from the item's inputs.
-
-    Args:
-        found: Result of `experts`, a dictionary from the name of each input to the Gaussian estimate from this input.
-        counts: A mask for each name in `found`, `(n,)`. True means that the item has the input.
-
-    Returns:
-        The belief, a Gaussian over the state code (pose, shape and mass) and the appearance code (all other visible
-        properties), `(n, code + look)`.
-    """
-    stacked = jax.tree.map(lambda *x: jnp.stack(x), *found.values())
-    return product_of_experts(stacked, jnp.stack([counts[name] for name in found]))
-
-
-def of_state(belief: Gaussian) -> Gaussian:
-    """Remove the appearance code from a belief, which is a Gaussian over the state code and the appearance code.
-
-    The state code describes the pose, the shape and the mass of an object. The appearance code describes all other
-    visible properties.
-
-    Args:
-        belief: Gaussian over both codes, `(n, code + look)`. The first `code` numbers are the state code, and the last
-            `look` numbers are the appearance code.
-
-    Returns:
-        Gaussian over the state code, `(n, code)`.
-    """
-    return Gaussian(belief.mean[:, : state.CODE], belief.log_var[:, : state.CODE])
-
-
-def _counted(counts: Bool[Array, "n"], values: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
-    """Set the values of masked items to zero."""
-    return jnp.where(counts.reshape(-1, *(1,) * (values.ndim - 1)), values, 0)
 
 
 def log_density(
     final: FinalPose, code: Float[Array, "n 12"], turn: Float[Array, "n 3 3"], outcome: Int[Array, "n"]
 ) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
-    """Evaluate predicted probability densities at the true outcomes and final poses of n trajectories.
+    """Evaluate predicted densities at the true outcomes and final poses of n trajectories.
 
     Args:
         final: Densities of the final poses.
-        code: Final pose codes (position and rotation matrix, see `statespace.poses`).
+        code: Final pose codes.
         turn: Rotation matrices from the first to the final poses.
         outcome: Indices into the outcomes of the scenario.
 
@@ -154,32 +79,17 @@ def excess(
     target: Float[Array, "n h w c"],
     counts: Float[Array, "n h w"] | None = None,
 ) -> Float[Array, "n"]:
-    """Binary cross-entropy of images, minus the entropy of the targets.
+    """Binary cross-entropy of images in [0, 1] minus the entropy of the targets (nats), summed over pixels and
+    channels.
 
-    Args:
-        image: Rendered images in [0, 1].
-        target: Target images in [0, 1].
-        counts: Weight of each pixel. If `counts` is None, each pixel has the weight 1.
-
-    Returns:
-        The difference for each image (nats), summed over pixels and channels.
+    `counts` are weights of the pixels, 1 if None.
     """
     image = jnp.clip(image, _LEAST, 1 - _LEAST)
     cross = target * jnp.log(image) + (1 - target) * jnp.log1p(-image)
     inside = jnp.clip(target, 1e-6, 1 - 1e-6)
-    own = inside * jnp.log(inside) + (1 - inside) * jnp.log1p(-inside)
-    each = jnp.sum(own - cross, axis=-1)
+    entropy = inside * jnp.log(inside) + (1 - inside) * jnp.log1p(-inside)
+    each = jnp.sum(entropy - cross, axis=-1)
     return jnp.sum(each if counts is None else counts * each, axis=(1, 2))
-
-
-def reduced(images: Float[Array, "*n h w c"], size: int) -> Float[Array, "*n size size c"]:
-    """Reduce images to `size` x `size` pixels by averaging over blocks.
-
-    `size` must divide the height and the width of the images.
-    """
-    *lead, height, width, channels = images.shape
-    blocks = images.reshape(*lead, size, height // size, size, width // size, channels)
-    return jnp.mean(blocks, axis=(-4, -2))
 
 
 class _Ends(NamedTuple):
@@ -217,10 +127,7 @@ def loss(
     falls: dict[str, Array] | None = None,
     beta: float | Float[Array, ""] = 1.0,
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-    """Compute the loss of one batch: a weighted sum of the terms that the docstring of the module defines.
-
-    A pose code is a scaled position and a rotation matrix. A state code describes the pose, the shape and the mass of
-    an object. An appearance code describes its other visible properties.
+    """Compute the loss of one batch, see the docstring of the module.
 
     Args:
         graphdef: Definition of the model, from `init`.
@@ -228,45 +135,38 @@ def loss(
         key: Random key for the choice of inputs and for the noise.
         inputs: All inputs of the model by name: images `visual` and `tactile` `(n, size, size, 3)` in [0, 1] with the
             side `input_size`, and pose codes `pose` `(n, 12)`.
-        targets: Images `visual` and `tactile` of the last frame `(n, size, size, 3)` in [0, 1] with the side
-            `image_size`. State codes `state` of the first frames, `(n, code)`, and pose codes `pose` of the last
-            frames, `(n, 12)`. The array `outcome`, `(n,)`, has one number for each trajectory: the index of its
-            outcome in the list of the scenario's outcomes.
+        targets: Images `visual` and `tactile` of the last frame in [0, 1] with the side `image_size`, state codes
+            `state` of the first frames, pose codes `pose` of the last frames, and `outcome`, `(n,)`, indices into the
+            outcomes of the scenario.
         empty: `visual` and `tactile` image of the empty sensor in [0, 1], with the side `input_size`.
-        present: Masks `(n,)` of the inputs. True means that the item has the input. An input without a mask is present
-            in all items. Each item must have at least one input. Values of items whose mask is False have no influence
-            and may be NaN.
-        condition: Known quantities of the scenario such as an acceleration, `(n, c)`, from
-            `training.Preprocessing.encode_condition`. None if the model has no condition.
-        views: Further objects in initial poses, without trajectories: images `visual` `(m, size, size, 3)` in [0, 1]
-            with the side `input_size`, and state codes `state` `(m, code)`. The model must have the input `visual`.
-        falls: Trajectories without images: `state`, `pose` and `outcome` as in `targets` and, if the model has a
-            condition, `condition`.
-        beta: Weight of the Kullback-Leibler divergence of the appearance code from its prior.
+        present: Masks `(n,)` of the inputs. An input without a mask is present in all items. Each item must have at
+            least one input. Values of items whose mask is False have no influence and may be NaN.
+        condition: From `training.Preprocessing.encode_condition`, or None.
+        views: Images `visual` `(m, size, size, 3)` in [0, 1] with the side `input_size`, and state codes `state`. The
+            model must have the input `visual`.
+        falls: `state`, `pose` and `outcome` as in `targets` and, if the model has a condition, `condition`.
+        beta: Weight of the divergence of the appearance code from its prior.
 
     Returns:
-        The loss, and its terms by name without their weights. Terms are means over items, and items without an input do
-        not count in the terms of this input. The terms `state`, `doubt` and `first` are sums over the
-        image inputs of the model. If `views` is given, `first` is computed for the visual images of the views instead.
-        To save time, the decoder renders images for only a part of the items: first frames (or views) for the share
-        `Config.drawn_first`, and last frames for the share `Config.drawn`.
-        The term `covered` is the sum of a mean for the first frame and a mean for the last frame. The term `state` is a
-        squared error of state codes, and all other terms are in nats.
+        The loss, and its terms by name without their weights, as means over items. Items without an input do not count
+        in the terms of this input. The terms `state`, `doubt` and `first` are sums over the image inputs of the model.
+        To save time, the decoder renders first frames (or views) only for the share `Config.drawn_first`, and last
+        frames for the share `Config.drawn`. All terms but `state` are in nats.
     """
     model = nnx.merge(graphdef, params)
     config = model.config
     number = len(targets["pose"])
     counts = {name: jnp.ones(number, bool) for name in config.inputs} | (present or {})
     choice, noise, blur, other = jax.random.split(key, 4)
-    found = experts(model, inputs, counts, empty)
-    images = [name for name in IMAGES if name in found]
+    estimates = experts(model, inputs, counts, empty)
+    images = [name for name in IMAGES if name in estimates]
     seen = {} if views is None else {"visual": model.encoders["visual"](views["visual"] - empty["visual"])}
-    terms = _state_terms(found, targets["state"], counts, seen, views)
+    terms = _state_terms(estimates, targets["state"], counts, seen, views)
 
     subsets = [s for size in range(1, len(config.inputs) + 1) for s in itertools.combinations(config.inputs, size)]
     members = [{name: counts[name] & (name in subset) for name in config.inputs} for subset in subsets]
-    beliefs = [fuse(found, own) for own in members]
-    ends = [_ends(belief, own, targets, condition) for belief, own in zip(beliefs, members, strict=True)]
+    beliefs = [fuse(estimates, masks) for masks in members]
+    ends = [_ends(belief, masks, targets, condition) for belief, masks in zip(beliefs, members, strict=True)]
     if falls is not None:
         ends.append(_known_ends(blur, falls))
     terms |= _end_terms(model, jax.tree.map(lambda *x: jnp.concatenate(x), *ends))
@@ -293,8 +193,8 @@ def loss(
         )
     else:
         known = {"visual": jnp.ones(len(views["state"][:first]), bool)}
-        own = fuse(jax.tree.map(lambda x: x[:first], seen), known)
-        before = _present_pictures(views["state"][:first], own, {"visual": views["visual"][:first]}, known)
+        of_views = fuse(jax.tree.map(lambda x: x[:first], seen), known)
+        before = _present_pictures(views["state"][:first], of_views, {"visual": views["visual"][:first]}, known)
     terms |= _picture_terms(model, (noise, other), after, before, empty)
     return _weighted(config.weights, terms, beta), terms
 
@@ -316,20 +216,12 @@ def _weighted(
 
 
 def rotation_between(code: Float[Array, "n code"], pose: Float[Array, "n 12"]) -> Float[Array, "n 3 3"]:
-    """Compute the rotation matrices from the first to the final poses.
-
-    Args:
-        code: State codes (pose, shape and mass) of the first frame. They begin with the pose codes.
-        pose: Pose codes (position and rotation matrix) of the last frame.
-
-    Returns:
-        Matrices `R_final @ R_first.T`, which rotate vectors in the sensor frame.
-    """
+    """Rotation matrices from the first frames, given by state codes, to the final poses: `R_final @ R_first.T`."""
     return poses.matrix(pose) @ jnp.swapaxes(poses.matrix(code[:, : poses.CODE]), -1, -2)
 
 
 def _state_terms(
-    found: dict[str, Gaussian],
+    estimates: dict[str, Gaussian],
     truth: Float[Array, "n code"],
     counts: dict[str, Bool[Array, "n"]],
     seen: dict[str, Gaussian],
@@ -337,8 +229,8 @@ def _state_terms(
 ) -> dict[str, Float[Array, ""]]:
     """The terms `state` and `doubt`, summed over the encoders, for first frames and views."""
     errors, doubts = [], []
-    for name in (name for name in IMAGES if name in found):
-        expert, code, valid = found[name], truth, counts[name]
+    for name in (name for name in IMAGES if name in estimates):
+        expert, code, valid = estimates[name], truth, counts[name]
         if views is not None and name in seen:
             expert = jax.tree.map(lambda *x: jnp.concatenate(x), expert, seen[name])
             code = jnp.concatenate([code, views["state"]])
@@ -382,7 +274,7 @@ def _drawn_belief(
     beliefs: Sequence[Gaussian],
 ) -> Gaussian:
     """Choose a random subset of the inputs with an image for each item, and return the belief from this subset."""
-    usable = jnp.stack([jnp.any(jnp.stack([own[name] for name in images]), axis=0) for own in members], axis=1)
+    usable = jnp.stack([jnp.any(jnp.stack([masks[name] for name in images]), axis=0) for masks in members], axis=1)
     chosen = jax.random.categorical(key, jnp.where(usable, 0.0, -jnp.inf))
     stacked = jax.tree.map(lambda *x: jnp.stack(x, axis=1), *beliefs)
     return jax.tree.map(lambda x: jnp.take_along_axis(x, chosen[:, None, None], axis=1)[:, 0], stacked)
@@ -470,7 +362,7 @@ def _picture_terms(
     }
     for name, image in before.images.items():
         counts = before.counts[name]
-        target = reduced(_counted(counts, image), size)
+        target = reduced(counted(counts, image), size)
         share = counts / jnp.maximum(jnp.sum(counts), 1)
         if name == "visual":
             seen = window.shows(target - small[name])
@@ -482,10 +374,5 @@ def _picture_terms(
 
 
 def _outline_nats(logit: Float[Array, "n h w 1"], seen: Float[Array, "n h w"]) -> Float[Array, "n"]:
-    """Cross-entropy of the probability that a pixel shows the object (nats), summed over pixels.
-
-    Args:
-        logit: Logit of the probability.
-        seen: 1 for pixels that show the object, else 0.
-    """
+    """Cross-entropy of the probability that a pixel shows the object (nats), summed over pixels."""
     return jnp.sum(jax.nn.softplus(logit[..., 0]) - seen * logit[..., 0], axis=(1, 2))

@@ -1,4 +1,4 @@
-"""Samples of final poses and of visual and tactile images from a state-space model, given any subset of the inputs."""
+"""Predictions of a state-space model: the calibrated density of the final pose, and samples of poses and images."""
 
 from typing import NamedTuple
 
@@ -8,18 +8,83 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from sts_jax.mvae import Gaussian
-from sts_jax.statespace import calibration, poses, state
-from sts_jax.statespace.layers import CONTRAST, Layers, compose
-from sts_jax.statespace.networks import FinalPose, Model
-from sts_jax.statespace.objective import reduced
+from sts_jax.statespace import poses, state
+from sts_jax.statespace.config import Config
+from sts_jax.statespace.networks import (
+    CONTRAST,
+    FinalPose,
+    Layers,
+    Model,
+    compose,
+    experts,
+    fuse,
+    of_state,
+    reduced,
+)
+
+
+class Calibration(NamedTuple):
+    """Numbers that correct the density of the final pose and set the contrast of sampled images, see `calibration`.
+
+    Each array has one value for each subset of the inputs. The subset with the inputs at the positions i of
+    `Config.inputs` has the index `sum(2**i)`. If `outcome`, `weight` and `variance` are 1, the density is unchanged.
+    """
+
+    outcome: Float[Array, "subsets"]  # exponent of the probabilities of the outcomes, in [1/4, 4]
+    weight: Float[Array, "subsets"]  # exponent of the weights of an outcome's mixture components, in [1/4, 1]
+    variance: Float[Array, "subsets"]  # factor of the variances of the components, in [1, 4]
+    contrast: Float[Array, "subsets"]  # contrast of the outlines in samples, `compose`
+
+
+def of_items(config: Config, calibration: Calibration, present: dict[str, Bool[Array, "n"]]) -> Calibration:
+    """The values of a calibration for the subset of the inputs that each item has, `(n,)`.
+
+    An item with the input `state` gets the values of no input, which do not change its density.
+    """
+    names = enumerate(config.inputs)
+    subset = jnp.asarray(sum(2**i * present[name].astype(int) for i, name in names if name in present))
+    corrected_as = jnp.where(present["state"], 0, subset) if "state" in present else subset
+    density = Calibration(*(x[corrected_as] for x in calibration))
+    return density._replace(contrast=calibration.contrast[subset])
+
+
+def predict(
+    model: Model,
+    inputs: dict[str, Array],
+    present: dict[str, Bool[Array, "n"]],
+    empty: dict[str, Float[Array, "size size 3"]],
+    condition: Float[Array, "n c"] | None = None,
+    calibration: Calibration | None = None,
+) -> tuple[Gaussian, FinalPose]:
+    """Infer the belief, `(n, code + look)`, and predict the density of the final pose.
+
+    The arguments after `model` are those of `sample`.
+    """
+    belief = fuse(experts(model, inputs, present, empty), present)
+    final = model.transition(of_state(belief), condition)
+    if calibration is None:
+        return belief, final
+    numbers = of_items(model.config, calibration, present)
+    return belief, corrected(final, numbers.outcome, numbers.weight, numbers.variance)
+
+
+def corrected(
+    final: FinalPose, outcome: Float[Array, "*n"], weight: Float[Array, "*n"], variance: Float[Array, "*n"]
+) -> FinalPose:
+    """Densities of the final pose with the exponents and the factor of a calibration, scalars or `(n,)`."""
+
+    def power(log: Array, exponent: Array) -> Array:
+        return jax.nn.log_softmax(log * exponent.reshape(-1, *(1,) * (log.ndim - 1)))
+
+    return final._replace(
+        outcome=power(final.outcome, outcome),
+        weight=power(final.weight, weight),
+        log_var=final.log_var + jnp.log(variance).reshape(-1, 1, 1, 1),
+    )
 
 
 class Samples(NamedTuple):
-    """Samples of the last frame: k final poses for each of n items, and images of some of these poses.
-
-    Each item has k poses, but only the poses with index 0 to `drawn` - 1 have images. `drawn` is an argument of
-    `sample`.
-    """
+    """Samples of the last frame: k final poses for each of n items, and images of the first `drawn` of these poses."""
 
     belief: Gaussian  # posterior of the state code and the appearance code of the first frame, (n, code + look)
     outcome: Float[Array, "n outcomes"]  # probability of each outcome
@@ -36,7 +101,7 @@ def sample(
     present: dict[str, Bool[Array, "n"]],
     empty: dict[str, Float[Array, "size size 3"]],
     condition: Float[Array, "n c"] | None = None,
-    correction: calibration.Calibration | None = None,
+    correction: Calibration | None = None,
     *,
     num: int,
     drawn: int,
@@ -47,55 +112,37 @@ def sample(
         graphdef: Definition of the model, from `init`.
         params: Parameters of the model.
         key: Random key for the samples.
-        inputs: One or more inputs of n items, by name. `visual` and `tactile` are images in [0, 1],
-            `(n, size, size, 3)`, where size is `Config.input_size`. `pose` contains pose codes, `(n, 12)`. `state`
-            contains true state codes (pose, shape and mass), `(n, code)`. Inputs other than `state` must be in the
-            model's `Config.inputs`.
-        present: A mask for each name in `inputs`, `(n,)`. True means that the item has the input. Values of other items
-            have no influence and may be NaN.
+        inputs: One or more inputs of n items, by name. `visual` and `tactile` are images in [0, 1], `(n, size, size,
+            3)`, where size is `Config.input_size`. `pose` has pose codes, `(n, 12)`, and `state` true state codes, `(n,
+            code)`.
+        present: A mask for each name in `inputs`. Values of items whose mask is False have no influence and may be NaN.
         empty: `visual` and `tactile` image of the empty sensor, `(size, size, 3)` in [0, 1].
-        condition: Known quantities of the scenario such as an acceleration, `(n, c)`, from
-            `training.Preprocessing.encode_condition`. None if the model has no condition.
-        correction: Calibration from `fit_calibration`, which corrects the density of the final pose and sets the
-            contrast. The contrast is the sharpness of the outlines in the sampled images. With None, the density is
-            unchanged, and the contrast is the default of `compose`.
+        condition: From `training.Preprocessing.encode_condition`, or None.
+        correction: Calibration from `fit_calibration`. With None, the density is unchanged, and the contrast is
+            `CONTRAST`.
         num: Number of final poses for each item.
-        drawn: Number of final poses with rendered visual and tactile images, from 1 to `num`. A random appearance code
-            is drawn for each of these poses.
-
-    Returns:
-        The posterior of the first frame, the probabilities of the outcomes (such as resting or falling off), the
-        sampled final poses and images, and the mean images of each item over the `drawn` samples. The posterior is a
-        Gaussian over the state code (pose, shape and mass) and the appearance code (all other visible properties).
-
-    Raises:
-        ValueError: `drawn` is out of range.
+        drawn: Number of final poses with images, from 1 to `num`. An appearance code is drawn for each of them.
     """
     if not 1 <= drawn <= num:
         raise ValueError(f"`drawn` must be from 1 to `num` ({num}), got {drawn}")
     model = nnx.merge(graphdef, params)
-    found = draw(model, key, inputs, present, empty, condition, correction, num=num, drawn=drawn)
-    contrast = jnp.full(len(found.outcome), CONTRAST)
+    samples = draw(model, key, inputs, present, empty, condition, correction, num=num, drawn=drawn)
+    contrast = jnp.full(len(samples.outcome), CONTRAST)
     if correction is not None:
-        contrast = calibration.of_items(model.config, correction, present).contrast
-    sharp = compose(found.layers, found.empty, found.level, jnp.tile(contrast, drawn))
-    soft = compose(found.layers, found.empty)
+        contrast = of_items(model.config, correction, present).contrast
+    sharp = compose(samples.layers, samples.empty, samples.level, jnp.tile(contrast, drawn))
+    soft = compose(samples.layers, samples.empty)
     return Samples(
-        belief=found.belief,
-        outcome=found.outcome,
-        pose=found.pose,
+        belief=samples.belief,
+        outcome=samples.outcome,
+        pose=samples.pose,
         images={name: x.reshape(drawn, -1, *x.shape[1:]) for name, x in sharp.items()},
         mean={name: x.reshape(drawn, -1, *x.shape[1:]).mean(0) for name, x in soft.items()},
     )
 
 
 class Drawn(NamedTuple):
-    """Samples for n trajectories: k final poses for each of them, and layers for some of these poses.
-
-    The layers are the outlines and colours of the objects, and the changes that the objects cause in the tactile
-    images. `compose` combines them with the images of the empty sensor, and returns complete images. For each
-    trajectory, only the first poses have layers. The argument `drawn` of `draw` is the number of these poses.
-    """
+    """Samples for n trajectories: k final poses for each of them, and layers for the first `drawn` of these poses."""
 
     belief: Gaussian  # posterior of the state code and the appearance code of the first frame, (n, code + look)
     outcome: Float[Array, "n outcomes"]  # probability of each outcome
@@ -112,19 +159,13 @@ def draw(
     present: dict[str, Bool[Array, "n"]],
     empty: dict[str, Float[Array, "size size 3"]],
     condition: Float[Array, "n c"] | None,
-    correction: calibration.Calibration | None,
+    correction: Calibration | None,
     *,
     num: int,
     drawn: int,
 ) -> Drawn:
-    """Sample final poses for each trajectory, and render layers for a part of these poses.
-
-    The argument `num` is the number of poses. The argument `drawn` is the number of poses with layers. The layers are
-    the outlines and colours of the objects, and the changes that the objects cause in the tactile images. `compose`
-    combines them with the images of the empty sensor, and returns complete images. The arguments after `model` are the
-    same as in `sample`.
-    """
-    belief, final = calibration.predict(model, inputs, present, empty, condition, correction)
+    """Sample final poses, and render layers for a part of them. The arguments after `model` are those of `sample`."""
+    belief, final = predict(model, inputs, present, empty, condition, correction)
     end, appearance, outline = jax.random.split(key, 3)
     codes, turns = jax.vmap(lambda key: _final_pose(key, final))(jax.random.split(end, num))
     known = jnp.broadcast_to(belief.mean[:, : state.CODE], (drawn, len(belief.mean), state.CODE))

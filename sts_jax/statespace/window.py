@@ -17,9 +17,9 @@ SMALLEST = 0.08  # side of the smallest window, divided by the side of the image
 
 
 class Window(NamedTuple):
-    """A square in each of n images, aligned with the principal axes of the object's silhouette.
+    """A square in each of n images, aligned with the principal axes of the silhouette.
 
-    The unit of all lengths and positions is the side of the image, so that the whole image has the side 1.
+    The unit of lengths and positions is the side of the image.
     """
 
     centre: Float[Array, "n 2"]  # column and row of the centre, from the left and the upper border of the image
@@ -28,27 +28,14 @@ class Window(NamedTuple):
 
 
 def shows(change: Float[Array, "n h w 3"]) -> Float[Array, "n h w"]:
-    """Find the pixels that show the object.
-
-    Args:
-        change: Images minus the image of the empty sensor, both in [0, 1].
-
-    Returns:
-        1 for pixels that differ from the empty sensor by more than 12/255 in any channel, else 0.
-    """
+    """1 for pixels that differ from the empty sensor by more than 12/255 in any channel, else 0."""
     return (jnp.max(jnp.abs(change), axis=-1) > THRESHOLD).astype(jnp.float32)
 
 
 def locate(change: Float[Array, "n size size 3"]) -> Window:
     """Find a square window around the object in each image, aligned with the principal axes of the silhouette.
 
-    The silhouette is the set of all pixels that differ from the image of the empty sensor, see `shows`.
-
-    Args:
-        change: Square images minus the image of the empty sensor, both in [0, 1].
-
-    Returns:
-        The windows. For an image without a silhouette, the window is the whole image.
+    Without a silhouette, it is the whole image. `change` is the image minus that of the empty sensor, both in [0, 1].
     """
     size = change.shape[1]
     weight = shows(change)
@@ -70,44 +57,31 @@ def locate(change: Float[Array, "n size size 3"]) -> Window:
     high = jnp.max(jnp.where(seen[..., None], turned, -jnp.inf), axis=(1, 2))
     side = jnp.maximum(jnp.max(high - low, axis=-1) * MARGIN + 1 / size, SMALLEST)
     centre = middle + poses.turn(angle, (low + high) / 2)
-    there = jnp.any(seen, axis=(1, 2))
+    visible = jnp.any(seen, axis=(1, 2))
     return Window(
-        jnp.where(there[:, None], centre, 0.5),
-        jnp.where(there[:, None], angle, jnp.array([1.0, 0.0])),
-        jnp.where(there, side, 1.0),
+        jnp.where(visible[:, None], centre, 0.5),
+        jnp.where(visible[:, None], angle, jnp.array([1.0, 0.0])),
+        jnp.where(visible, side, 1.0),
     )
 
 
 def cut(images: Float[Array, "n size size c"], window: Window, side: int) -> Float[Array, "n side side c"]:
     """Cut the windows out of images, and resample each window to `side` x `side` pixels.
 
-    A pixel of the result is the mean of four values from `sample`.
-
-    Args:
-        images: Square images.
-        window: Window in each image, from `locate`.
-        side: Side of the results (pixels).
-
-    Returns:
-        Images of the windows. `locate` aligns each window with the silhouette of the object. The column index
-        increases along the long axis of this silhouette.
+    The column index increases along the long axis of the silhouette. A pixel is the mean of four values from `sample`.
     """
     fine = 2 * side
     grid = (jnp.arange(fine) + 0.5) / fine - 0.5
     apart = jnp.stack(jnp.meshgrid(grid, grid), axis=-1).reshape(1, -1, 2) * window.side[:, None, None]
     places = window.centre[:, None] + poses.turn(window.angle[:, None], apart)
-    found = sample(images, places * images.shape[1] - 0.5)
-    return jnp.mean(found.reshape(len(images), side, 2, side, 2, -1), axis=(2, 4))
+    fine_pixels = sample(images, places * images.shape[1] - 0.5)
+    return jnp.mean(fine_pixels.reshape(len(images), side, 2, side, 2, -1), axis=(2, 4))
 
 
 def sample(images: Float[Array, "n side side c"], places: Float[Array, "n m 2"]) -> Float[Array, "n m c"]:
     """Interpolate each image bilinearly at m places. Pixels outside the image count as 0.
-    Args:
-        images: Square images.
-        places: Column and row of each place (pixels). Whole numbers are pixel centres.
 
-    Returns:
-        Values at the places, 0 at places that are more than one pixel beyond the centres of the outermost pixels.
+    `places` are columns and rows (pixels). Whole numbers are pixel centres.
     """
     framed = jnp.pad(images, ((0, 0), (1, 1), (1, 1), (0, 0)))
     return bilinear_batch(framed, places[..., 0] + 1, places[..., 1] + 1)
