@@ -77,19 +77,6 @@ def test_gradient_descent_on_half_the_square_shrinks_the_parameters_geometricall
         np.testing.assert_allclose(record["beta"], np.mean([min(s / 3, 1) for s in (step - 2, step - 1)]), rtol=1e-6)
 
 
-@pytest.mark.slow
-def test_a_term_is_added_to_the_usual_loss(tmp_path):
-    training.train(CONFIG, MODEL, arrays(), workdir=tmp_path / "usual")
-    training.train(CONFIG, MODEL, arrays(), workdir=tmp_path / "none", loss=with_penalty(MODEL, 0.0))
-    training.train(CONFIG, MODEL, arrays(), workdir=tmp_path / "more", loss=with_penalty(MODEL, 0.5))
-    usual, none, more = (records(tmp_path / name) for name in ("usual", "none", "more"))
-    for before, after in zip(usual, none, strict=True):
-        assert after == pytest.approx(before | {"penalty": 0.0}, rel=1e-5)
-    for record in more:
-        assert record["penalty"] > 0
-    assert more[-1]["penalty"] < more[0]["penalty"]
-
-
 @pytest.mark.parametrize("kill", [3, pytest.param(5, marks=pytest.mark.slow)])
 def test_a_killed_run_with_another_loss_and_optimiser_gives_identical_parameters(tmp_path, kill):
     def run(folder, **more):
@@ -123,18 +110,6 @@ def test_a_folder_is_not_resumed_with_another_loss_optimiser_or_note(tmp_path):
             run(optimiser=other, notes=notes)
     assert training.load(tmp_path).step == 4
     assert run(optimiser=adam, notes=notes).step == 6
-
-
-@pytest.mark.slow
-def test_an_optimiser_without_arrays_resumes(tmp_path):
-    def run(folder, optimiser, **more):
-        return training.train(CONFIG, MODEL, arrays(), workdir=tmp_path / folder, optimiser=optimiser, **more)
-
-    with pytest.raises(Killed):
-        run("killed", optax.sgd(1e-3), progress=kill_at(5))
-    with pytest.raises(ValueError, match="has no state of this optimiser"):
-        run("killed", optax.sgd(1e-3, momentum=0.9))
-    same(run("killed", optax.sgd(1e-3)).state, run("whole", optax.sgd(1e-3)).state)
 
 
 def test_a_loss_without_its_own_value_among_its_parts_is_refused(tmp_path):

@@ -88,23 +88,6 @@ def test_computing_equal_subsets_once_equals_plain_enumeration(config, asked, ab
     close(plain, quick)
 
 
-def test_a_sample_without_any_input_keeps_its_empty_subsets():
-    inputs, targets = batch(VECTORS), batch(VECTORS, 1)
-    nothing = jnp.arange(BATCH) < 2
-    masks = {"a": ~nothing, "b": jnp.zeros(BATCH, bool), "c": ~nothing}
-    plain = gradient(VECTORS, inputs, targets, present=masks)
-    quick = gradient(VECTORS, inputs, targets, present={"a": ~nothing, "c": ~nothing}, absent=("b",))
-    close(plain, quick)
-
-
-def test_an_input_that_is_not_given_is_absent():
-    inputs, targets = batch(VECTORS), batch(VECTORS, 1)
-    a = gradient(VECTORS, inputs, targets, absent=("b",))
-    del inputs["b"]
-    b = gradient(VECTORS, inputs, targets)
-    close(a, b, 1e-6)
-
-
 @pytest.mark.parametrize("asked", ["all", "own"])
 def test_the_loss_equals_a_loop_over_subsets_and_samples(asked):
     """Vectors only, so that samples are independent. The noise follows from the key as documented."""
@@ -184,14 +167,6 @@ def test_a_prediction_uses_only_the_modalities_that_are_present(fill):
     alone, _ = run(touch, {})
     for name in alone:
         np.testing.assert_allclose(got[name][~mask], alone[name][~mask], atol=1e-5)
-
-
-def test_the_posterior_without_inputs_is_the_prior():
-    graphdef, params, stats = mvae.init(jax.random.key(0), CONFIG)
-    state = nnx.merge_state(params, stats)
-    posterior = mvae.infer(graphdef, state, batch(CONFIG), present={n: jnp.zeros(BATCH, bool) for n in CONFIG.names})
-    np.testing.assert_array_equal(posterior.mean, 0)
-    np.testing.assert_array_equal(posterior.log_var, 0)
 
 
 def test_a_condition_reaches_the_decoders():

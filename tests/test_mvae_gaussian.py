@@ -28,17 +28,6 @@ def test_product_is_the_normalised_product_of_densities(present):
     np.testing.assert_allclose(jnp.exp(got.log_var), [variance], rtol=1e-5)
 
 
-@pytest.mark.parametrize(("mean", "log_var"), [(0.0, 0.0), (1.3, -2.0), (-0.4, 1.2)])
-def test_divergence_is_the_integral(mean, log_var):
-    p, q = density(mean, log_var), density(0, 0)
-    where = p > 0
-    integrand = np.zeros_like(p)
-    integrand[where] = p[where] * (np.log(p[where]) - np.log(q[where]))
-    expected = np.trapezoid(integrand, GRID)
-    got = kl_standard_normal(Gaussian(jnp.array([mean]), jnp.array([log_var])))
-    np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-6)
-
-
 @pytest.mark.parametrize("subset", [(), (0,), (1,), (2,), (0, 1), (0, 2), (1, 2), (0, 1, 2)])
 def test_linear_gaussian_model_has_its_exact_posterior_and_evidence(subset):
     """With the exact experts of z ~ N(0, I_2), x_m = a_m z + noise, the bound of every subset equals the evidence.

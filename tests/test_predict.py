@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 import pathlib
-import shutil
 
 import jax
 import jax.numpy as jnp
@@ -113,15 +112,6 @@ def test_masked_and_untouched_items_fall_back_on_the_rest(predictor):
     np.testing.assert_allclose(out.mean[2], untouched.mean, atol=1e-5)
 
 
-def test_samples_scatter_about_the_mean(predictor):
-    out = predictor(pose=measurement(2)["pose"], key=jax.random.key(0), num_samples=5)
-    assert out.samples.visual.shape == (5, 2, SIDE, SIDE, 3)
-    assert out.samples.pose.shape == (5, 2, 7)
-    assert np.std(out.samples.pose[..., :3], axis=0).min() > 0
-    again = predictor(pose=measurement(2)["pose"], key=jax.random.key(0), num_samples=5)
-    np.testing.assert_array_equal(out.samples.pose, again.samples.pose)
-
-
 def test_each_shape_and_subset_is_compiled_once(predictor):
     predictor(pose=measurement(4)["pose"])
     before = predict._cache_size()
@@ -130,12 +120,6 @@ def test_each_shape_and_subset_is_compiled_once(predictor):
     assert predict._cache_size() == before
     predictor(**measurement(4))
     assert predict._cache_size() == before + 1
-
-
-def test_the_prediction_without_inputs_is_that_of_the_prior(predictor):
-    out = predictor.prior((2,))
-    np.testing.assert_array_equal(out.mean, 0)
-    np.testing.assert_array_equal(out.visual[0], out.visual[1])
 
 
 def broken(name, change):
@@ -159,7 +143,11 @@ GIVEN, POSE = measurement(2), measurement()["pose"]
         (broken("pose", lambda x: x * 2), ValueError, "quaternion of length 2"),
         (broken("pose", lambda x: x + np.eye(7, dtype=np.float32)[0] * 40), ValueError, "give metres"),
         (broken("pose", lambda x: np.where(np.arange(7) == 4, 1e30, x)), ValueError, r"quaternion of length 1e\+30"),
-        (broken("pose", lambda x: np.where(np.arange(7) == 4, 1e300, x)), ValueError, "pose has NaN or infinite"),
+        (
+            broken("pose", lambda x: np.where(np.arange(7) == 4, 1e300, x.astype(float))),
+            ValueError,
+            "pose has NaN or infinite",
+        ),
         (broken("pose", lambda x: x[:, :6]), TypeCheckError, "pose"),
         (broken("pose", lambda x: x[0]), TypeCheckError, "pose"),
         ({"pose": np.array([0, 0, 0, 1, 0, 0, 0])}, ValueError, "pose is int"),
@@ -242,21 +230,6 @@ def test_a_checkpoint_of_another_view_is_refused(folder):
         sts.Predictor.load(folder, crop=True)
     with pytest.raises(ValueError, match=r"resolution=\(32, 32\), but resolution=\(64, 64\) is needed"):
         sts.Predictor.load(folder, resolution=(64, 64))
-
-
-def test_a_missing_or_torn_model_is_named(folder, tmp_path):
-    with pytest.raises(FileNotFoundError, match="nowhere"):
-        sts.Predictor.load(tmp_path / "nowhere")
-    torn = shutil.copytree(folder, tmp_path / "torn")
-    (torn / "config.json").write_text('{"model": ')
-    with pytest.raises(OSError, match=r"torn.*config\.json"):
-        sts.Predictor.load(torn)
-    (torn / "config.json").write_bytes((folder / "config.json").read_bytes())
-    np.savez(
-        torn / "blank.npz", visual=np.zeros((SIDE, SIDE, 3), np.uint8), tactile=np.zeros((SIDE, SIDE, 3), np.uint8)
-    )
-    with pytest.raises(OSError, match=r"blank\.npz is not the file that manifest\.json lists"):
-        sts.Predictor.load(torn)
 
 
 def test_a_model_without_preprocessing_is_named(folder, tmp_path, monkeypatch):
@@ -442,16 +415,6 @@ def test_the_prior_of_a_state_space_model_is_standard_normal(state_predictor):
     assert np.abs(out.outcome_probability[0] - out.outcome_probability[1]).max() > 1e-4  # the condition differs
 
 
-def test_a_saved_state_space_model_is_loaded_unchanged(state_predictor, tmp_path):
-    state_predictor.save(tmp_path / "copy")
-    again = sts.Predictor.load(tmp_path / "copy")
-    jax.tree.map(np.testing.assert_array_equal, again.model.state, state_predictor.model.state)
-    assert repr(again) == (
-        f"Predictor('{tmp_path / 'copy'}': takes visual, tactile, pose; predicts visual, tactile, pose; "
-        "resolution=(32, 32), crop=False, condition=3, steps=0)"
-    )
-
-
 @pytest.mark.parametrize(
     "change", [{"resolution": (16, 16)}, {"crop": True}, {"rotation": "quaternion"}, {"position_scale": 0.1}]
 )
@@ -487,21 +450,6 @@ def test_a_compact_copy_predicts_nearly_the_same(kind, request, tmp_path):
     out, want = again(**given, **more), original(**given, **more)
     for name in ("visual", "tactile", "mean", "log_var"):
         np.testing.assert_allclose(getattr(out, name), getattr(want, name), atol=5e-3)
-
-
-def test_any_flipped_bit_in_compact_weights_is_found_and_named(compact, tmp_path):
-    folder, rng = shutil.copytree(compact, tmp_path / "copy"), np.random.default_rng(0)
-    (weights,) = folder.rglob("weights.npz")
-    whole = weights.read_bytes()
-    for place in (0, *rng.integers(len(whole), size=5)):
-        flipped = bytearray(whole)
-        flipped[place] ^= 1 << rng.integers(8)
-        weights.write_bytes(flipped)
-        with pytest.raises(OSError, match=r"weights\.npz is not the file that manifest\.json lists"):
-            sts.Predictor.load(folder)
-    weights.unlink()
-    with pytest.raises(OSError, match=r"weights\.npz is missing"):
-        sts.Predictor.load(folder)
 
 
 def test_a_model_of_the_library_is_loaded_by_its_name(compact, predictor, tmp_path, monkeypatch):

@@ -40,18 +40,6 @@ def test_basis_equals_scipy():
     np.testing.assert_allclose(harmonics.basis(jnp.asarray(places), DEGREE), expected_basis(places), atol=2e-5)
 
 
-def test_basis_is_orthonormal():
-    """Gauss-Legendre quadrature in the height and equal steps of the azimuth are exact for these polynomials."""
-    height, weight = np.polynomial.legendre.leggauss(DEGREE + 1)
-    azimuth = 2 * np.pi * np.arange(2 * DEGREE + 2) / (2 * DEGREE + 2)
-    level = np.sqrt(1 - height**2)[:, None]
-    z = np.broadcast_to(height[:, None], (len(height), len(azimuth)))
-    places = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), z], axis=-1).reshape(-1, 3)
-    share = np.repeat(weight / 2, len(azimuth)) / len(azimuth)
-    found = np.asarray(harmonics.basis(jnp.asarray(places, jnp.float32), DEGREE), np.float64)
-    np.testing.assert_allclose(found.T @ (share[:, None] * found), np.eye(COUNT), atol=1e-5)
-
-
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_harmonic_is_homogeneous_in_its_degree(degree):
     places = directions(20)

@@ -122,12 +122,6 @@ def changed(params, path, change):
     return new
 
 
-@pytest.mark.parametrize("drawn", [0, 3])
-def test_number_of_rendered_samples_is_checked(model, empty, drawn):
-    with pytest.raises(ValueError, match=rf"`drawn` must be from 1 to `num` \(2\), got {drawn}"):
-        statespace.sample(*model, jax.random.key(0), {}, {}, empty, num=2, drawn=drawn)
-
-
 def test_excess_equals_the_metric_and_is_zero_at_the_target():
     rng = np.random.default_rng(0)
     image, target = (rng.uniform(0.01, 0.99, (2, 8, 8, 3)).astype(np.float32) for _ in range(2))
@@ -142,12 +136,6 @@ def test_excess_equals_the_metric_and_is_zero_at_the_target():
         metrics.image_error(image[:, :4], target[:, :4]).excess,
         rtol=1e-4,
     )
-
-
-def test_reduced_images_are_means_of_blocks():
-    image = np.random.default_rng(0).random((6, 6, 3), np.float32)
-    expected = [[image[2 * i : 2 * i + 2, 2 * j : 2 * j + 2].mean((0, 1)) for j in range(3)] for i in range(3)]
-    np.testing.assert_allclose(networks.reduced(jnp.asarray(image), 3), expected, rtol=1e-5)
 
 
 def test_log_density_is_that_of_a_mixture_in_the_turned_frame():
@@ -305,14 +293,6 @@ def test_tint_is_the_mean_colour_of_the_object_in_the_visual_image(model, empty,
     np.testing.assert_array_equal(found["tactile"].mean[:, rows], 0)  # a tactile image shows no colours
     for name in ("tactile", "pose"):
         np.testing.assert_array_equal(found[name].log_var[:, rows], networks.UNKNOWN_LOG_VAR)
-
-
-def test_untrained_decoder_draws_objects_in_their_tint(model, batch):
-    tint = jnp.array([[0.5, -1.0, 2.0]])
-    look = jnp.zeros((1, CONFIG.look)).at[:, :3].set(tint)
-    code = batch.targets["state"][:1]
-    drawn = nnx.merge(*model).decoder(code[:, :12], jnp.eye(3)[None], code, look)
-    np.testing.assert_allclose(np.mean(drawn.colour, axis=(1, 2)), 0.4 + 0.12 * tint, atol=0.1)
 
 
 def test_belief_from_several_inputs_is_the_product_of_their_beliefs(sample, batch):

@@ -67,11 +67,6 @@ def test_heading_is_that_of_the_first_level_axis(rotation, expected):
     np.testing.assert_allclose(poses.heading(code), expected, atol=1e-6)
 
 
-def test_unknown_rotation_has_the_heading_of_the_sensor_and_no_gradient():
-    np.testing.assert_array_equal(poses.heading(jnp.zeros(12)), [1, 0])
-    np.testing.assert_array_equal(jax.grad(lambda code: poses.heading(code).sum())(encode(random_poses(1))[0]), 0)
-
-
 def test_turned_variance_is_the_diagonal_of_the_turned_covariance():
     rng = np.random.default_rng(0)
     variance = rng.uniform(0.1, 2, 12).astype(np.float32)

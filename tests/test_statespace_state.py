@@ -40,27 +40,6 @@ def box(*size):
     return corners * size
 
 
-def test_join_inverts_split():
-    code = random_states(np.random.default_rng(0), NUMBER)
-    parts = state.split(code)
-    assert code.shape == (NUMBER, state.CODE)
-    assert tuple(part.shape[1] for part in parts) == state.SIZES
-    np.testing.assert_array_equal(state.join(parts), code)
-    np.testing.assert_array_equal(parts.pose, code[:, :12])
-
-
-def test_ball_of_mean_size_and_unit_mass_has_the_code_zero():
-    rotations = Rotation.random(NUMBER, random_state=0)
-    ball = DIRECTIONS * state.MEAN * state.LENGTH
-    parts = state.split(encoded(rotations, ball, mass=state.MASS))
-    for part in parts[1:]:
-        np.testing.assert_allclose(part, 0, atol=1e-5)
-    heavier = state.split(encoded(rotations, 1.1 * ball, mass=np.e * state.MASS))
-    np.testing.assert_allclose(heavier.mass, 1, rtol=1e-5)
-    for part in (heavier.support, heavier.support_in_sensor):
-        np.testing.assert_allclose(part, np.eye(state.SUPPORT)[:1] * 0.1 * state.MEAN * np.ones((NUMBER, 1)), atol=1e-5)
-
-
 def test_shown_shape_is_that_of_the_rotated_vertices():
     rng = np.random.default_rng(0)
     rotations = Rotation.random(NUMBER, random_state=2)
@@ -83,14 +62,6 @@ def test_reach_is_the_depth_of_the_lowest_vertex():
     expected = [-(rotation.apply(points)[:, 2].min()) for rotation in since * present]
     np.testing.assert_allclose(found, expected, atol=2e-4)
     assert np.ptp(expected) > 1e-3
-
-
-def test_shown_centre_of_mass_is_the_rotated_one():
-    rotations = Rotation.random(NUMBER, random_state=3)
-    com = np.array([0.004, -0.002, 0.007])
-    parts = state.split(encoded(rotations, box(0.04, 0.03, 0.02), com=com))
-    np.testing.assert_allclose(parts.com, np.tile(com, (NUMBER, 1)) / state.LENGTH, rtol=1e-5)
-    np.testing.assert_allclose(parts.com_in_sensor, rotations.apply(com) / state.LENGTH, atol=1e-5)
 
 
 def test_turned_state_is_the_state_of_the_turned_pose():

@@ -56,12 +56,6 @@ def test_the_remedy_fits_the_error(tmp_path, number, remedy):
         storage.write_whole(tmp_path / "x.npz", fails)
 
 
-def test_a_folder_in_the_way_is_named(tmp_path):
-    (tmp_path / "x.npz").mkdir()
-    with pytest.raises(OSError, match=r"cannot write .*x\.npz: .*Remove the file or folder that is in the way"):
-        storage.write_bytes(tmp_path / "x.npz", b"")
-
-
 def test_an_error_of_the_writer_passes_unchanged(tmp_path):
     def wrong(temporary: Path) -> None:
         raise ValueError("not of this shape")
@@ -102,12 +96,6 @@ def test_damaged_json_is_named_with_the_remedy(tmp_path, content):
     assert path.read_bytes() == content
 
 
-def test_a_folder_instead_of_a_file_is_named(tmp_path):
-    (tmp_path / "a.json").mkdir()
-    with pytest.raises(storage.DamagedFileError, match=r"a\.json.*delete it"):
-        storage.read_json(tmp_path / "a.json", "delete it")
-
-
 def test_other_settings_are_refused_and_equal_ones_are_not(tmp_path):
     path = tmp_path / "config.json"
     storage.claim(path, {"seed": 0, "gel": {"sizes": (1, 2)}})
@@ -123,17 +111,33 @@ def test_other_settings_are_refused_and_equal_ones_are_not(tmp_path):
         storage.claim(path, {"seed": 0})
 
 
-def test_a_checksum_is_that_of_the_content(tmp_path):
-    path = tmp_path / "a"
-    path.write_bytes(b"abc")  # the example of FIPS 180-4
-    assert storage.sha256(path) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
-
-
 def test_a_digest_depends_on_the_content_and_not_on_the_layout():
     content = {"b": (1, 2), "a": 0.1}
     assert storage.digest(content) == hashlib.sha256(b'{"a": 0.1, "b": [1, 2]}').hexdigest()
     assert storage.digest(json.loads(json.dumps(content, indent=7))) == storage.digest(content)
     assert storage.digest({"b": (1, 3), "a": 0.1}) != storage.digest(content)
+
+
+def test_each_mismatch_of_a_folder_with_its_manifest_is_named(tmp_path):
+    for name in "ab":
+        (tmp_path / name).write_text(name)
+    assert storage.read_manifest(tmp_path, "remedy") is None
+    manifest = storage.write_manifest(tmp_path, storage.checksums(tmp_path, "ab"), {"step": 3})
+    assert storage.read_manifest(tmp_path, "remedy") == manifest
+    storage.verify(tmp_path, manifest, "remedy")
+    (tmp_path / "a").write_text("b")
+    for names, message in ((None, "a is not the file"), (["b", "c"], "c is not listed in")):
+        with pytest.raises(storage.DamagedFileError, match=rf"{message}.*: remedy\."):
+            storage.verify(tmp_path, manifest, "remedy", names)
+    (tmp_path / "a").unlink()
+    with pytest.raises(storage.DamagedFileError, match="a is missing, but"):
+        storage.verify(tmp_path, manifest, "remedy")
+    path = tmp_path / storage.MANIFEST
+    for old, new in (('"step": 3', '"step": 4'), ('"facts"', '"face"'), (manifest.files["a"], manifest.files["b"])):
+        path.write_text(path.read_text().replace(old, new))
+        with pytest.raises(storage.DamagedFileError, match=r"manifest\.json is damaged, .*: remedy"):
+            storage.read_manifest(tmp_path, "remedy")
+        storage.write_manifest(tmp_path, *manifest)
 
 
 HOLD = """

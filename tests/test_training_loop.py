@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import shutil
 from pathlib import Path
 
 import jax
@@ -79,17 +78,6 @@ def test_a_finished_run_is_not_changed(finished):
     assert files(workdir) == before
 
 
-def test_a_model_is_loaded_from_its_folder(finished):
-    workdir, model = finished
-    loaded = training.load(str(workdir))
-    same(loaded.state, model.state)
-    assert loaded.config == SMALL
-    assert loaded.graphdef == model.graphdef
-    assert loaded.step == 12
-    assert loaded.settings["preprocessing"] == {"view": "pad"}
-    assert [p.name for p in (workdir / "checkpoints").iterdir()] == ["00000012"]
-
-
 def test_another_config_or_other_data_are_refused(finished):
     workdir, _ = finished
     with pytest.raises(
@@ -98,19 +86,6 @@ def test_another_config_or_other_data_are_refused(finished):
         training.train(training.TrainConfig(steps=13), SMALL, arrays(), workdir=workdir, preprocessing={"view": "pad"})
     with pytest.raises(ValueError, match=r"made with data.checksum"):
         training.train(CONFIG, SMALL, arrays(seed=1), workdir=workdir, preprocessing={"view": "pad"})
-
-
-@pytest.mark.parametrize("torn", ["config", "no checkpoint", "nothing"])
-def test_a_torn_folder_is_named(tmp_path, finished, torn):
-    folder = tmp_path / "run"
-    if torn != "nothing":
-        shutil.copytree(finished[0], folder)
-    if torn == "config":
-        (folder / "config.json").write_text((folder / "config.json").read_text()[:50])
-    if torn == "no checkpoint":
-        (folder / "checkpoints").rename(tmp_path / "elsewhere")
-    with pytest.raises(OSError, match=f"{folder}.*(train again|train one there)"):
-        training.load(folder)
 
 
 def test_a_state_keeps_its_structure_and_dtypes():
@@ -254,25 +229,6 @@ def test_a_killed_run_of_a_state_space_model_ends_with_the_same_bits(tmp_path):
     same(loaded.state, whole.state)
     assert (loaded.config, loaded.graphdef, loaded.step) == (STATE, whole.graphdef, 6)
     assert loaded.settings["kind"] == "statespace"
-
-
-@pytest.mark.slow
-def test_a_batch_has_as_many_views_and_falls_as_configured(tmp_path, monkeypatch):
-    asked = []
-    take = training.Arrays.take
-
-    def remember(self, index, **further):
-        asked.append({name: rows.tolist() for name, rows in further.items()})
-        return take(self, index, **further)
-
-    monkeypatch.setattr(training.Arrays, "take", remember)
-    with pytest.raises(Killed):
-        training.train(STATE_CONFIG, STATE, bars(further=True), workdir=tmp_path, progress=kill_at(3))
-    for name, size, samples in (("views", 2, 3), ("falls", 3, 5)):
-        rows = [batch[name] for batch in asked[:3]]  # the batch of step 4 was prepared during step 3
-        assert [len(batch) for batch in rows] == [size] * 3
-        once = [row for batch in rows for row in batch][:samples]
-        assert sorted(once) == list(range(samples))  # every row once before any is repeated
 
 
 @pytest.mark.slow

@@ -68,8 +68,8 @@ def verified(folder: Path) -> int | None:
     listed = manifest(folder)
     step = None if listed is None else listed.facts["step"]
     if listed is not None and step is not None:
-        there = [name for name in (CONFIG, BLANK) if (folder / name).exists()]
-        names = dict.fromkeys([*listed.files, *there, *_files(folder, step)])
+        beside = [name for name in (CONFIG, BLANK) if (folder / name).exists()]
+        names = dict.fromkeys([*listed.files, *beside, *_files(folder, step)])
         storage.verify(folder, listed, _remedy(folder), [name for name in names if name != CALIBRATION])
     return step
 
@@ -127,8 +127,11 @@ def restore(folder: Path, like: TrainState) -> TrainState | None:
             the optimiser may be None.
     """
     step = verified(folder)
-    if step is None:
-        return None
+    return None if step is None else read(folder, step, like)
+
+
+def read(folder: Path, step: int, like: TrainState) -> TrainState:
+    """Read the checkpoint of a step in a verified folder."""
     path = folder / _place(step)
     loaded: dict[str, Array] = {}
     for part, wanted in _parts(like).items():

@@ -65,7 +65,8 @@ def _load(workdir: Path, calibrated: bool) -> Model:
     path = workdir / folder.CONFIG
     if not path.exists():
         raise FileNotFoundError(f"{workdir} has no config.json: give the folder of a trained model, or train one there")
-    if folder.verified(workdir) is None:
+    step = folder.verified(workdir)
+    if step is None:
         raise FileNotFoundError(f"{workdir} has no checkpoint: run its training until the first checkpoint is written")
     settings = storage.read_json(path, f"delete {workdir} and train again")
     try:
@@ -76,12 +77,11 @@ def _load(workdir: Path, calibrated: bool) -> Model:
             f"{path} does not describe a model that this version of sts_jax can load ({type(error).__name__}: "
             f"{error}): use the version that trained the model, or delete {workdir} and train again"
         ) from error
-    weights = folder.restore(workdir, like)
-    assert weights is not None
+    weights = folder.read(workdir, step, like)
     graphdef = nnx.graphdef(nnx.eval_shape(lambda: _module(config)))
     fitted = folder.read_calibration(workdir) if calibrated else None
     state = nnx.merge_state(weights.params, weights.stats)
-    return Model(config, graphdef, state, int(weights.step), settings, fitted[0] if fitted else None)
+    return Model(config, graphdef, state, step, settings, fitted[0] if fitted else None)
 
 
 def _initial_weights(config: Config) -> folder.TrainState:
