@@ -187,7 +187,6 @@ ONES = jnp.ones(BATCH, bool)
         ({"target_present": {"sound": ONES}}, r"unknown names \['sound'\]"),
         ({"inputs": {"sound": ONES}}, r"unknown names \['sound'\]"),
         ({"targets": {}}, r"needs exactly these targets, got targets \[\]"),
-        ({"asked": "some"}, "asked='some'"),
         ({"condition": jnp.ones((BATCH, 2))}, "width 2"),
     ],
 )
