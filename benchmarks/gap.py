@@ -133,7 +133,7 @@ def recording(folder: Path, note: str) -> Iterator[hardware.Session]:
         note: Description of the session, which is stored with it.
     """
     origin = hardware.Origin(note, "TWIN", SIZE[1], SIZE[0], ON)
-    with hardware.Session.open(folder, origin) as session:
+    with hardware.Session(folder, origin) as session:
         yield session
         session.flush()
 

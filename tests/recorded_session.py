@@ -55,7 +55,7 @@ def record(workdir, count, *, leds="0123", sensor_file=True, seed=0):
         empty = raw(drawn(None, None))
         device.save(workdir, sts.Sensor(), (empty, empty))
     origin = hardware.Origin("camera", leds, SIZE[1], SIZE[0], LEVELS)
-    with hardware.Session.open(workdir / "dataset", origin) as session:
+    with hardware.Session(workdir / "dataset", origin) as session:
         for row, column in places:
             number = session.begin()
             for end, place in (("initial", (row, column)), ("final", (row + 10, column))):

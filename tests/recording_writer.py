@@ -4,14 +4,10 @@ import itertools
 import sys
 
 import numpy as np
+from session_writer import ORIGIN, SIZE
 
-from sts_jax.hardware.leds import Lit
-from sts_jax.hardware.proof import Settling, Shot
-from sts_jax.hardware.recording import Recorder
-from sts_jax.hardware.session import Origin
+from sts_jax.hardware import Lit, Recorder, Settling, Shot
 
-SIZE = (48, 64)
-ORIGIN = Origin("camera", "0123", SIZE[1], SIZE[0], (255, 255, 255, 255))
 PERIOD_S = 0.05  # s, between two images
 
 

@@ -29,7 +29,7 @@ def pair(number, end, size=SIZE):
 
 def write(folder):
     """Collect until killed."""
-    with Session.open(folder, ORIGIN) as session:
+    with Session(folder, ORIGIN) as session:
         print("ready", os.getpid(), flush=True)
         while True:
             number = session.begin()

@@ -16,7 +16,7 @@ SIZE = (96, 128)
 def write(folder, numbers, shift=0):
     """A session of random images, which follow from the number of the trajectory."""
     origin = hardware.Origin("camera", "0123", SIZE[1], SIZE[0], (255, 255, 255, 255))
-    with hardware.Session.open(folder, origin) as session:
+    with hardware.Session(folder, origin) as session:
         while (number := session.begin()) <= max(numbers):
             if number not in numbers:
                 continue

@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 import pytest
 from led_simulator import WAIT_S
-from recording_writer import ORIGIN, SIZE, shot
+from recording_writer import shot
+from session_writer import ORIGIN, SIZE
 
 import sts_jax as sts
 from experiments import live

@@ -275,7 +275,7 @@ def test_the_end_of_the_input_stops(monkeypatch):
 
 @pytest.fixture
 def workdir(tmp_path):
-    with hardware.Session.open(tmp_path / "dataset", ORIGIN) as session:
+    with hardware.Session(tmp_path / "dataset", ORIGIN) as session:
         for number in range(3):
             for end in ("initial", "final"):
                 session.save(number, end, pair(number, end))

@@ -55,7 +55,7 @@ def sensor(peer):
 
 
 def collect(sensor, folder, person, count):
-    with hardware.Session.open(folder, hardware.Origin.of(sensor), settling=sensor.settling) as session:
+    with hardware.Session(folder, hardware.Origin.of(sensor), settling=sensor.settling) as session:
         return hardware.collect(sensor, session, person, config=GUIDE, trusted=True, count=count)
 
 
@@ -175,7 +175,7 @@ def test_a_camera_that_returns_interrupts_nothing_confirmed(peer, sensor, tmp_pa
 def test_a_camera_that_stays_away_ends_collecting(peer, sensor, tmp_path):
     person = Playing(Player(peer))
     sensor._timeout_s = 0.5
-    with hardware.Session.open(tmp_path / "session", hardware.Origin.of(sensor)) as session:
+    with hardware.Session(tmp_path / "session", hardware.Origin.of(sensor)) as session:
         peer.camera.stop()
         with pytest.raises((hardware.CameraError, hardware.LightError)):
             hardware.collect(sensor, session, person, config=GUIDE, trusted=True, patience_s=1.0)

@@ -12,7 +12,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from recording_writer import ORIGIN, PERIOD_S, SIZE, shot, write
+from recording_writer import PERIOD_S, shot, write
+from session_writer import ORIGIN, SIZE
 from test_experiments_real import sensor_file
 
 from benchmarks.instruments.sensor_peer import SensorPeer

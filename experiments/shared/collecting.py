@@ -82,7 +82,7 @@ def collect(config: Collect) -> None:
         say("connecting. Keep the pad empty, and do not move anything in view")
         with sensor:
             origin = hardware.Origin.of(sensor)
-            with hardware.Session.open(config.workdir / "dataset", origin, settling=sensor.settling) as session:
+            with hardware.Session(config.workdir / "dataset", origin, settling=sensor.settling) as session:
                 if config.sensor is not None:
                     keep(config.sensor, config.workdir)
                 say(f"{session.folder} has {session.confirmed} confirmed trajectories. New ones are added")

@@ -94,7 +94,7 @@ class Recorder:
         self._size = origin.height, origin.width
         self._encoding = encoding
         self._start_s: float | None = None  # time of the first image (s)
-        self._videos: dict[str, av.VideoStream] = {}
+        self._videos: dict[str, tuple[av.container.OutputContainer, av.VideoStream]] = {}
         self._open = True
         if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
             raise FileExistsError(f"{self.folder} is not an empty folder: give the name of a new folder.")
@@ -120,10 +120,10 @@ class Recorder:
             )
         self._start_s = shot.time_s if self._start_s is None else self._start_s
         try:
-            video = self._videos.get(shot.stream) or self._video(shot.stream)
+            container, video = self._videos.get(shot.stream) or self._video(shot.stream)
             frame = av.VideoFrame.from_ndarray(shot.image, format="rgb24").reformat(format=video.pix_fmt)
             frame.pts = round(1000 * (shot.time_s - self._start_s))
-            video.container.mux(video.encode(frame))
+            container.mux(video.encode(frame))
             self._lines.write((json.dumps({"stream": shot.stream, **shot_facts(shot)}) + "\n").encode())
         except OSError as error:
             self._end()
@@ -133,7 +133,7 @@ class Recorder:
             ) from error
         self.counts[shot.stream] += 1
 
-    def _video(self, stream: Stream) -> av.VideoStream:
+    def _video(self, stream: Stream) -> tuple[av.container.OutputContainer, av.VideoStream]:
         """Begin the video of a stream."""
         container = av.open(str(self.folder / f"{stream}.mkv"), "w", format="matroska", options=_PER_IMAGE)
         pixels, options = _CODECS[self._encoding]
@@ -141,8 +141,8 @@ class Recorder:
         video.height, video.width = self._size
         video.pix_fmt, video.time_base = pixels, Fraction(1, 1000)
         video.codec_context.time_base = video.time_base
-        self._videos[stream] = video
-        return video
+        self._videos[stream] = container, video
+        return self._videos[stream]
 
     def _end(self) -> None:
         """Close the files."""
@@ -150,16 +150,16 @@ class Recorder:
         self._lines.close()
         while self._videos:
             with contextlib.suppress(OSError):
-                self._videos.popitem()[1].container.close()
+                self._videos.popitem()[1][0].close()
 
     def close(self) -> None:
         """Close the files, and write the manifest. Closing twice is allowed."""
         if not self._open:
             return
         try:
-            for video in self._videos.values():
-                video.container.mux(video.encode())
-                video.container.close()
+            for container, video in self._videos.values():
+                container.mux(video.encode())
+                container.close()
         finally:
             self._end()
         written = {path.name for path in self.folder.iterdir()} - {storage.MANIFEST} - self._copied.keys()
@@ -212,12 +212,12 @@ class Replay:
         self._folder: Path | None = None
         if isinstance(source, tuple):
             self._name = " and ".join(map(str, source))
-            self._videos = dict(zip(("visual", "tactile"), map(Path, source), strict=True))
+            self._videos: dict[Stream, Path] = {"visual": Path(source[0]), "tactile": Path(source[1])}
             self._stills = _unproven(self._videos)
         else:
             self._folder = sensor_file(source).parent
             self._name = str(self._folder)
-            self._videos = {stream: self._folder / f"{stream}.mkv" for stream in ("visual", "tactile")}
+            self._videos = {"visual": self._folder / "visual.mkv", "tactile": self._folder / "tactile.mkv"}
             self._stills = _recorded(self._folder, self._videos)
         if not self._stills:
             raise ValueError(f"{self._name} has no image: make a new recording.")
@@ -353,7 +353,9 @@ def _unproven(videos: dict[Stream, Path]) -> list[Shot]:
 def _times(path: Path) -> list[float]:
     """The times of the frames of a video (s), in the order of the file."""
     with av.open(str(path)) as container:
-        return [float(packet.pts * packet.time_base) for packet in container.demux(video=0) if packet.size]
+        return [
+            float((packet.pts or 0) * (packet.time_base or 0)) for packet in container.demux(video=0) if packet.size
+        ]
 
 
 def _count(path: Path) -> int:

@@ -21,7 +21,6 @@ import time
 import urllib.parse
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal, NamedTuple
 
 import cv2
@@ -160,9 +159,6 @@ class Recordings:
             progress(done, len(self))
         return RecordedImages(np.array(visual), np.array(tactile), np.array(self.numbers))
 
-    def __repr__(self) -> str:
-        return f"Recordings({str(self.folder)!r}, {len(self)} trajectories)"
-
 
 def load_recordings(folder: str | os.PathLike) -> Recordings:
     """The confirmed trajectories of the session in a folder. Another process may add trajectories meanwhile."""
@@ -216,6 +212,23 @@ def _read_origin(folder: Path) -> Origin:
         return storage.decode(Origin, manifest.facts, "origin")
     except ValueError as error:
         raise ValueError(f"{folder} holds no session ({error}): give the folder of a session.") from error
+
+
+def _prepare(folder: Path, origin: Origin) -> None:
+    """Write the manifest of a session, or compare it, and remove what a killed process has left."""
+    if not (folder / MANIFEST).exists():
+        storage.write_manifest(folder, {}, dataclasses.asdict(origin))
+    now, recorded = dataclasses.asdict(origin), dataclasses.asdict(_read_origin(folder))
+    if changed := [name for name in now if now[name] != recorded[name]]:
+        raise ValueError(
+            f"{folder} was recorded with {', '.join(f'{name} = {recorded[name]!r}' for name in changed)}, but this "
+            f"sensor has {', '.join(f'{name} = {now[name]!r}' for name in changed)}: choose another folder."
+        )
+    for kind in (TRAJECTORIES, DISCARDED):
+        (folder / kind).mkdir(exist_ok=True)
+    for rest in (*folder.glob(".*.partial"), *folder.glob(f"{TRAJECTORIES}/*/.*.partial")):
+        shutil.rmtree(rest) if rest.is_dir() else rest.unlink()
+    storage.flush_folder(folder)
 
 
 def _trajectory(folder: Path, number: int, kind: str = TRAJECTORIES) -> Path:
@@ -344,20 +357,18 @@ class SessionError(OSError):
     """Raised if a session cannot be written or cannot accept more changes. The message states cause and remedy."""
 
 
-@dataclasses.dataclass(frozen=True)
-class _Job:
+class _Job(NamedTuple):
     """A change of the session that the background thread writes to disk."""
 
     name: str  # description for messages
     run: Callable[[], None]  # function that writes the change
-    confirms: int | None = None  # number of the trajectory that the change confirms, if any
 
 
 class Session:
     """A folder to which trajectories are added.
 
     ```python
-    with Session.open("runs/real/dataset", Origin.of(sensor)) as session:
+    with Session("runs/real/dataset", Origin.of(sensor)) as session:
         session.check_ready()
         number = session.begin()
         session.save(number, "initial", sensor.read())
@@ -373,9 +384,19 @@ class Session:
     `check_ready` before each trajectory avoids.
     """
 
-    def __init__(self, folder: Path, lock: contextlib.ExitStack, origin: Origin, settling: Settling | None):
-        self.folder = folder
-        self._lock, self._settling = lock, settling
+    def __init__(self, folder: str | os.PathLike, origin: Origin, *, settling: Settling | None = None):
+        """Start a new session, or continue an existing one. The folder is locked until `close`.
+
+        Args:
+            folder: Folder of the session.
+            origin: Identity of the sensor. An existing session must have the same origin.
+            settling: Settling times of the lights, which are stored with each pair. None: not stored.
+        """
+        self.folder, self._settling = Path(folder), settling
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(storage.lock(self.folder))
+            _prepare(self.folder, origin)
+            self._lock = stack.pop_all()
         self._next = next_recording(folder)
         self._confirmed = {entry.number for entry in list_recordings(folder) if entry.standing == "confirmed"}
         self._raw_bytes = 4 * 3 * origin.width * origin.height  # uncompressed size of a trajectory's images
@@ -386,36 +407,6 @@ class Session:
         self._closing = False
         self._thread = threading.Thread(target=self._run, name="writer of the session", daemon=True)
         self._thread.start()
-
-    @classmethod
-    def open(cls, folder: str | Path, origin: Origin, *, settling: Settling | None = None) -> "Session":
-        """Start a new session, or continue an existing one. The folder is locked until `close`.
-
-        Args:
-            folder: Folder of the session.
-            origin: Identity of the sensor. An existing session must have the same origin.
-            settling: Settling times of the lights, which are stored with each pair. None: not stored.
-        """
-        folder = Path(folder)
-        with contextlib.ExitStack() as stack:
-            stack.enter_context(storage.lock(folder))
-            if not (folder / MANIFEST).exists():
-                storage.write_manifest(folder, {}, dataclasses.asdict(origin))
-            recorded = dataclasses.asdict(_read_origin(folder))
-            changes = {name: value for name, value in dataclasses.asdict(origin).items() if value != recorded[name]}
-            if changes:
-                raise ValueError(
-                    f"{folder} was recorded with {', '.join(f'{name} = {recorded[name]!r}' for name in changes)}, but "
-                    f"this sensor has {', '.join(f'{name} = {value!r}' for name, value in changes.items())}: choose "
-                    "another folder."
-                )
-            for kind in (TRAJECTORIES, DISCARDED):
-                (folder / kind).mkdir(exist_ok=True)
-            # A process that was killed leaves partial files.
-            for rest in (*folder.glob(".*.partial"), *folder.glob(f"{TRAJECTORIES}/*/.*.partial")):
-                shutil.rmtree(rest) if rest.is_dir() else rest.unlink()
-            storage.flush_folder(folder)
-            return cls(folder, stack.pop_all(), origin, settling)
 
     @property
     def confirmed(self) -> int:
@@ -469,7 +460,7 @@ class Session:
             pair: The images.
         """
         folder = _trajectory(self.folder, number)
-        facts = {shot.stream: shot_facts(shot) for shot in (pair.visual, pair.tactile)}
+        facts: dict[str, Any] = {shot.stream: shot_facts(shot) for shot in (pair.visual, pair.tactile)}
         settling = None if self._settling is None else dataclasses.asdict(self._settling)
 
         def write() -> None:
@@ -493,8 +484,13 @@ class Session:
                 f"trajectory {number} cannot be confirmed yet: call save() with the {' and the '.join(missing)} image "
                 "pair of this trajectory before confirm()"
             )
-        write = lambda: _confirm(self.folder, number, note)  # noqa: E731
-        self._add(_Job(f"the confirmation of trajectory {number}", write, number))
+
+        def write() -> None:
+            _confirm(self.folder, number, note)
+            with self._changed:
+                self._confirmed.add(number)
+
+        self._add(_Job(f"the confirmation of trajectory {number}", write))
 
     def discard(self, number: int) -> None:
         """Move a trajectory to the folder `discarded`, in the background. Nothing is deleted."""
@@ -533,16 +529,14 @@ class Session:
     def __enter__(self) -> "Session":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _add(self, job: _Job) -> None:
         """Append a job to the queue of the background thread."""
         with self._changed:
             if self._closing:
-                raise SessionError(f"the session of {self.folder} is closed: open it again with Session.open().")
+                raise SessionError(f"the session of {self.folder} is closed: make a new Session.")
             if len(self._jobs) >= _QUEUE:
                 raise SessionError(
                     f"{job.name} was not accepted, because {len(self._jobs)} changes are not on disk yet: wait with "
@@ -568,8 +562,6 @@ class Session:
                 self._error = error
                 if error is None:
                     self._jobs.popleft()
-                    if job.confirms is not None:
-                        self._confirmed.add(job.confirms)
                 else:
                     self._changed.wait_for(lambda: self._closing, _RETRY_S)
                 self._changed.notify_all()

@@ -83,7 +83,7 @@ class VirtualSensor:
 
     @property
     def origin(self) -> Origin:
-        """Description of this sensor for `hardware.Session.open`: the devices, the image size and the LED levels."""
+        """Description of this sensor for `hardware.Session`: the devices, the image size and the LED levels."""
         return Origin(CAMERA, self._twin.serial_number, *self._size, self._levels)
 
     def read(self) -> Pair:
