@@ -194,9 +194,9 @@ def test_noise_is_measured():
     measured = guide.empty_pad(
         [guide.Observation(float(i), **{name: look[i] for name, look in looks.items()}) for i in range(200)]
     )
-    np.testing.assert_allclose(measured.visual_noise.mean(), 2, rtol=0.05)
-    np.testing.assert_allclose(measured.imprint_noise.mean(), 2, rtol=0.05)
-    np.testing.assert_allclose(measured.tactile, 100, atol=1)
+    np.testing.assert_allclose(measured.noise.visual.mean(), 2, rtol=0.05)
+    np.testing.assert_allclose(measured.noise.imprint.mean(), 2, rtol=0.05)
+    np.testing.assert_allclose(measured.mean.tactile, 100, atol=1)
 
 
 def test_an_interruption_starts_the_rest_anew():

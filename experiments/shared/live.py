@@ -246,7 +246,7 @@ class Live:
             return None, None
         observation = guide.observe(tactile.time_s, visual.image, tactile.image)
         contact = guide.has_contact(hardware.GuideConfig(), self._empty, observation)
-        change = np.abs(observation.visual - self._empty.visual).max(-1)
+        change = np.abs(observation.visual - self._empty.mean.visual).max(-1)
         return contact, contact or int((change > _OCCUPIED).sum()) >= _BLOCKS
 
 

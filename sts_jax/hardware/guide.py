@@ -77,16 +77,11 @@ class Observation(NamedTuple):
     imprint: SmallBlocks  # small blocks of the tactile image, in which contacts are detected
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class EmptyPad:
-    """Means of the blocks of the empty pad, and the standard deviations of their noise (0: unknown)."""
+class EmptyPad(NamedTuple):
+    """The appearance of the empty pad."""
 
-    visual: Blocks
-    tactile: Blocks
-    imprint: SmallBlocks
-    visual_noise: Blocks
-    tactile_noise: Blocks
-    imprint_noise: SmallBlocks
+    mean: Observation
+    noise: Observation  # standard deviation of each block, 0: unknown
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -114,7 +109,10 @@ def observe(time_s: float, visual: Image, tactile: Image) -> Observation:
 def empty_pad(observations: Sequence[Observation]) -> EmptyPad:
     """Measure the empty pad and its noise from at least two observations without movement."""
     looks = [np.stack(blocks) for blocks in zip(*(seen[1:] for seen in observations), strict=True)]
-    return EmptyPad(*(blocks.mean(0) for blocks in looks), *map(_noise, looks))
+    time_s = observations[-1].time_s
+    return EmptyPad(
+        Observation(time_s, *(blocks.mean(0) for blocks in looks)), Observation(time_s, *map(_noise, looks))
+    )
 
 
 def _noise(looks: Float[np.ndarray, "n rows columns 3"]) -> Float[np.ndarray, "rows columns 3"]:
@@ -124,9 +122,9 @@ def _noise(looks: Float[np.ndarray, "n rows columns 3"]) -> Float[np.ndarray, "r
 
 
 def known_pad(visual: Image, tactile: Image) -> EmptyPad:
-    """The empty pad from one raw pair, such as the background images of a sensor file. Its noise is unknown."""
-    looks = observe(0.0, visual, tactile)[1:]
-    return EmptyPad(*looks, *map(np.zeros_like, looks))
+    """The empty pad from one raw pair, such as the backgrounds of a sensor file. Its noise is unknown."""
+    seen = observe(0.0, visual, tactile)
+    return EmptyPad(seen, Observation(0.0, *map(np.zeros_like, seen[1:])))
 
 
 def start(empty: EmptyPad | None = None, *, trusted: bool = False) -> State:
@@ -215,11 +213,11 @@ def has_contact(config: GuideConfig, empty: EmptyPad, observation: Observation) 
 
     The median difference is subtracted first, so that a change in the brightness of the whole image is no contact.
     """
-    change = observation.imprint - empty.imprint
+    change = observation.imprint - empty.mean.imprint
     change = change - np.median(change, axis=(0, 1))
     # A contact covers less than half of the image, and hardly changes this median. `known_pad` does not know the noise.
     shared = _NORMAL * np.median(np.abs(change))
-    measured = empty.imprint_noise * math.sqrt(1 + 1 / config.pairs)  # of the image and of the mean of `pairs` images
+    measured = empty.noise.imprint * math.sqrt(1 + 1 / config.pairs)  # of the image and of the mean of `pairs` images
     noise = np.maximum(measured, shared)
     return int((np.abs(change) > _threshold(config, noise)).any(-1).sum()) >= config.contact_blocks
 
@@ -233,7 +231,7 @@ def _same(config: GuideConfig, state: State, first: Observation, second: Observa
             recent = [getattr(seen, stream) for seen in (*state.window[-4:], second)]
             noise = _NORMAL * np.median(np.abs(np.diff(recent, axis=0))) / math.sqrt(2)
         else:
-            noise = getattr(state.empty, f"{stream}_noise")
+            noise = getattr(state.empty.noise, stream)
         if (np.abs(two - one) > _threshold(config, math.sqrt(2) * noise)).any():
             return False
     return True
