@@ -2,14 +2,9 @@
 
     python -m benchmarks.depth    # about two minutes on two CPU cores
 
-Prints, for each size and object, how far the depths of interior pixels and of all other pixels on the object differ
-from embree's depths. Also prints the number of pixels at the silhouette, and the number of pixels that are on the
-object in only one of the two images. A pixel is interior if the rays of its 3x3 neighbourhood all hit the object and
-the depths of these rays differ by less than 1 mm.
-
 Four objects are procedural, four are loaded from miniworld's meshes (Apache 2.0), one is a concave bowl and one a thin
-sheet. In four poses the object presses on the pad with 1 N, in three it is above the pad, and in three it is partly out
-of view. `tests/test_frame_depth.py` tests some of these cases. The command writes no files.
+sheet. A pixel is interior if the rays of its 3x3 neighbourhood all hit the object and the depths of these rays differ
+by less than 1 mm. `tests/test_frame_depth.py` tests some of these cases.
 """
 
 import dataclasses
@@ -26,8 +21,7 @@ import trimesh
 import tyro
 
 import sts_jax as sts
-from benchmarks.instruments.meshes import public_meshes
-from benchmarks.instruments.truth import body_mesh, embree, interior, neighbours
+from benchmarks.instruments.truth import body_mesh, embree, interior, neighbours, public_meshes
 from sts_jax import geometry, objects
 
 SIZES = ((64, 64), (97, 53), (200, 200), (480, 640))
@@ -39,11 +33,7 @@ NUM_POSES = (4, 3, 3)
 
 
 class Difference(NamedTuple):
-    """Pixel counts and the largest interior error from the comparison of a depth image with embree's depth image.
-
-    A pixel is interior if the rays of its 3x3 neighbourhood all hit the object and the depths of these rays differ by
-    less than 1 mm. The interior error is the error of the depth in interior pixels.
-    """
+    """Pixel counts and the largest interior error from the comparison of a depth image with embree's depth image."""
 
     interior: int
     interior_beyond_10um: int
@@ -57,10 +47,7 @@ class Difference(NamedTuple):
 
 
 def make(name: str) -> objects.Body:
-    """Make the object with the given name, one of the ten objects of this benchmark. They are 50 to 130 mm long.
-
-    An object from a mesh file has no texture here, because a texture does not change the depth image.
-    """
+    """Make the object with the given name, one of the ten objects of this benchmark. They are 50 to 130 mm long."""
     if name in PROCEDURAL:
         return objects.make(jax.random.key(5), name)
     with warnings.catch_warnings(), tempfile.TemporaryDirectory() as folder:
@@ -83,18 +70,7 @@ def make(name: str) -> objects.Body:
 
 
 def places(body: objects.Body, rng: np.random.Generator, kind: str) -> tuple[jax.Array, jax.Array]:
-    """Sample a random pose of an object, and compute the wrench of the pad on the object.
-
-    Args:
-        body: The object.
-        rng: Source of the random pose.
-        kind: "touching" if the object touches the pad, "above" if it is above the pad, or "out of view" if the
-            position is so far from the middle of the pad that a part of the object is usually out of view.
-
-    Returns:
-        The pose `(7,)` and the wrench `(6,)`. For the kind "touching", the wrench is due to a force of 1 N upwards at
-        the object's lowest point. For the other kinds, the wrench is zero.
-    """
+    """Sample a random pose of an object, and compute the wrench of the pad on the object."""
     quat = rng.normal(size=4)
     quat /= np.linalg.norm(quat)
     points = np.asarray(geometry.transform(jnp.asarray([0, 0, 0, *quat], jnp.float32), body.vertices))
@@ -114,16 +90,7 @@ def places(body: objects.Body, rng: np.random.Generator, kind: str) -> tuple[jax
 
 
 def cases(body: objects.Body, seed: int, numbers: Sequence[int] = NUM_POSES) -> Iterator[tuple[jax.Array, jax.Array]]:
-    """Sample random poses of an object, and compute the wrench of the pad on the object in each pose.
-
-    Args:
-        body: The object.
-        seed: Seed of the random poses.
-        numbers: Number of poses of each kind, in this order: touching the pad, above the pad, partly out of view.
-
-    Yields:
-        A pose `(7,)` and its wrench `(6,)`, see `places`.
-    """
+    """Sample random poses of an object, and compute the wrench of the pad on the object in each pose."""
     rng = np.random.default_rng(seed)
     for kind, number in zip(POSES, numbers, strict=True):
         for _ in range(number):
@@ -131,16 +98,7 @@ def cases(body: objects.Body, seed: int, numbers: Sequence[int] = NUM_POSES) -> 
 
 
 def difference(depth: np.ndarray, truth: np.ndarray) -> Difference:
-    """Compare a depth image with the depth image of the ray tracer Embree.
-
-    Args:
-        depth: The rendered depth (m), `(h, w)`, infinite where a ray misses the object.
-        truth: Embree's depth (m), `(h, w)`, infinite where a ray misses the object.
-
-    Returns:
-        A `Difference`. Its field `worst` is the largest error in the interior of the object (m). The other fields are
-        numbers of pixels, such as the number of interior pixels with an error above 10 um.
-    """
+    """Compare a depth image with the depth image of the ray tracer Embree."""
     seen, hit = np.isfinite(depth), np.isfinite(truth)
     inner = interior(truth)
     other = hit & seen & ~inner
@@ -162,10 +120,7 @@ def difference(depth: np.ndarray, truth: np.ndarray) -> Difference:
 
 
 def total(differences: Sequence[Difference]) -> Difference:
-    """Combine the results of `difference` for several images.
-
-    Numbers of pixels are added. The field `worst`, the largest error, becomes the largest error in all images.
-    """
+    """Combine the results of `difference` for several images."""
     added = {name: sum(getattr(d, name) for d in differences) for name in Difference._fields if name != "worst"}
     return Difference(**added, worst=max(d.worst for d in differences))
 
@@ -173,20 +128,7 @@ def total(differences: Sequence[Difference]) -> Difference:
 def measure(
     names: Sequence[str], shape: tuple[int, int], numbers: Sequence[int] = NUM_POSES, *, first_seed: int = 0
 ) -> dict[str, Difference]:
-    """Compare the depth in rendered frames with the depth that the ray tracer embree computes.
-
-    Embree traces the object in the same pose in which `sense` renders it. This pose is the field `Frame.pose`, the pose
-    after the object has sunk into the gel.
-
-    Args:
-        names: Names of the objects, from `PROCEDURAL`, `LOADED` and `MADE`.
-        shape: Height and width of the images (pixels).
-        numbers: Number of poses of each kind, in this order: touching the pad, above the pad, partly out of view.
-        first_seed: Offset of the seeds of the random poses.
-
-    Returns:
-        A dictionary from the name of each object to the combined `Difference` of all its images.
-    """
+    """Compare the depth in rendered frames with the depth that the ray tracer embree computes."""
     sensor = sts.Sensor()
     sense = jax.jit(lambda *inputs: sts.sense(sensor, *inputs, resolution=shape))
     found = {}
@@ -213,10 +155,7 @@ def describe(d: Difference) -> str:
 
 
 def main() -> None:
-    """Print how far rendered depths differ from the depths of embree's ray tracing.
-
-    For each image size, there is one row for each object, and a last row for all objects together.
-    """
+    """Print how far rendered depths differ from the depths of embree's ray tracing."""
     print(f"{'':28} interior  % <10 um  >100um  worst um elsewhere  % <1 mm silhouette  differs  strays")
     for shape in SIZES:
         found = measure(PROCEDURAL + LOADED + MADE, shape)

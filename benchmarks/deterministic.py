@@ -1,15 +1,10 @@
-"""Errors of a plain network that predicts a single final state, for comparison with the state-space model.
+"""Errors of a plain convolutional network without latent variables, for comparison with the state-space model.
 
     python -m benchmarks.deterministic runs/freefall  # takes about 9 minutes on two CPU cores with the default preset
     python -m benchmarks.deterministic runs/perturbed --scenario perturbed --seconds 480
 
-Trains a convolutional network without latent variables on the dataset of a run. The inputs of the network are the
-first images, the first pose and the condition. The condition consists of known quantities of the scenario, such as the
-acceleration of the pad. The loss contains the cross-entropies of the last visual image, of the last tactile image and
-of the outcome (how the trajectory ends, such as `FELL_OFF`), and the squared error of the final pose. Only trajectories
-with images are used. For a comparison at equal cost, set `--seconds` to the training time of the run's state-space
-model. Prints the errors of the network and of the baselines, which are simple predictions without a model. The
-printed errors are not written to a file. Missing parts of the run's dataset are collected.
+The network predicts a single last frame from the first images, the first pose and the condition. For a comparison at
+equal cost, set `--seconds` to the training time of the run's state-space model.
 """
 
 import dataclasses
@@ -48,11 +43,7 @@ class Args:
 
 
 class Network(nnx.Module):
-    """Predicts the last images (64x64), pose and outcome from the first images (128x128), pose and condition.
-
-    The condition consists of known quantities of the trajectory, such as the acceleration of the pad. Poses are encoded
-    as pose codes of 12 numbers, see `training.Preprocessing.encode_pose`.
-    """
+    """Predicts the last images (64x64), pose and outcome from the first images (128x128), pose and condition."""
 
     def __init__(self, images: int, numbers: int, outcomes: int, rngs: nnx.Rngs) -> None:
         widths = [3 * images, 32, 64, 128, 128]
@@ -65,12 +56,7 @@ class Network(nnx.Module):
         self.up = nnx.List([nnx.Conv(a, 4 * b, (3, 3), rngs=rngs) for a, b in ((128, 64), (64, 32), (32, 6))])
 
     def __call__(self, images: Float[Array, "n h w c"], numbers: Float[Array, "n k"]) -> tuple[Array, Array, Array]:
-        """Predict the last state from the arrays of `features`.
-
-        Returns:
-            Logits `(n, 64, 64, 6)`, three channels of the visual image and three of the tactile one, pose codes
-            `(n, 12)`, and logits of the outcomes, `(n, outcomes)`.
-        """
+        """Predict the last state from the arrays of `features`."""
         x = images
         for layer in self.down:
             x = jax.nn.swish(layer(_fold(x)))
@@ -97,30 +83,14 @@ def _unfold(x: Float[Array, "n h w c"]) -> Float[Array, "n 2*h 2*w c/4"]:
 
 
 def features(inputs: dict[str, Array], condition: Array | None, empty: dict[str, Array]) -> tuple[Array, Array]:
-    """Prepare the inputs of the network.
-
-    Args:
-        inputs: The key `pose` has the encoded poses, `(n, 12)`. The key `visual` has the visual images, uint8
-            `(n, 128, 128, 3)`. The optional key `tactile` has the tactile images, in the same shape.
-        condition: Encoded known quantities of each trajectory, such as the acceleration of the pad, `(n, c)`. None: the
-            scenario has none.
-        empty: Images of the untouched sensor under the keys `visual` and `tactile`, uint8.
-
-    Returns:
-        Images minus the images of the untouched sensor, stacked in the channels, `(n, 128, 128, 3 or 6)`, and encoded
-        poses joined with the conditions, `(n, 12 + c)`.
-    """
+    """Prepare the inputs of the network."""
     images = [inputs[name] / 255.0 - empty[name] / 255.0 for name in ("visual", "tactile") if name in inputs]
     numbers = [inputs["pose"]] if condition is None else [inputs["pose"], condition]
     return jnp.concatenate(images, axis=-1), jnp.concatenate(numbers, axis=-1)
 
 
 def loss(graphdef: nnx.GraphDef[Network], params: nnx.State, batch: dict[str, Any]) -> Array:
-    """Compute the mean loss of a batch.
-
-    The loss is a weighted sum of four terms: the cross-entropies of the last visual image, of the last tactile image
-    and of the outcome, and the squared error of the final pose.
-    """
+    """Compute the mean loss of a batch."""
     picture, pose, outcome = nnx.merge(graphdef, params)(*features(batch["inputs"], batch["condition"], batch["empty"]))
     targets = batch["targets"]
     visual, tactile = (
@@ -135,18 +105,7 @@ def loss(graphdef: nnx.GraphDef[Network], params: nnx.State, batch: dict[str, An
 def fit(
     arrays: training.Arrays, network: nnx.GraphDef[Network], params: nnx.State, seconds: float, seed: int
 ) -> tuple[nnx.State, int]:
-    """Train the network, with a learning rate that falls along a cosine of the elapsed time.
-
-    Args:
-        arrays: Training data.
-        network: Definition of the network.
-        params: Initial parameters of the network. They cannot be used afterwards.
-        seconds: Duration of the training (s) without the first step, which includes the compilation.
-        seed: Seed of the order of the batches.
-
-    Returns:
-        The trained parameters and the number of steps.
-    """
+    """Train the network, with a learning rate that falls along a cosine of the elapsed time."""
     optimiser = optax.chain(optax.clip_by_global_norm(3e3), optax.scale_by_adam(b2=0.99))
 
     @functools.partial(jax.jit, donate_argnums=(0, 1))
@@ -170,14 +129,7 @@ def fit(
 def predict(
     graphdef: nnx.GraphDef[Network], params: nnx.State, job: run.Job, arrays: training.Arrays
 ) -> evaluation.Predicted:
-    """Predict the last images, pose and outcome of every trajectory.
-
-    Args:
-        graphdef: Definition of the network.
-        params: Trained parameters of the network.
-        job: The training job of the run. Its preprocessing decodes the predicted poses.
-        arrays: The trajectories. The targets in these arrays are not used.
-    """
+    """Predict the last images, pose and outcome of every trajectory."""
 
     @jax.jit
     def run(batch: dict[str, Any]) -> tuple[Array, ...]:

@@ -5,20 +5,13 @@
     python -m benchmarks.device --pairs 1000 --twin                                              # the digital twin
     python -m benchmarks.device --pairs 10 --lags-ms 15
 
-A pair is a visual image (light off) and a tactile image (light on). No hardware is needed. A separate process emulates
-the LED controller on a pseudo-terminal and the camera on a local network port. The emulated images are of one colour,
-except for a corner that shows the number of the frame (`instruments/sensor_peer.py`). With `--twin` they are images of
-the digital twin (`instruments/twin_peer.py`), whose object is held or released after every ten pairs.
+A separate process emulates the LED controller on a pseudo-terminal and the camera on a local network port, with lags
+(from the end of an exposure to the sending of the frame) of several lengths in turn. With `--twin`, the images are
+those of the twin. The light of an image is wrong or mixed if its mean in the camera's log differs from the requested
+light by more than 0.1 % of full light.
 
-The lag of a camera is the time from the end of a frame's exposure to the sending of the frame. The emulated camera has
-several lags in turn, and `hardware.STS` reads an equal share of the pairs at each lag. At each lag, `hardware.STS` also
-measures its settling times, from a switch of the light to the first frame that shows only the new light. The emulated
-camera logs the light during each exposure. The light of an image counts as wrong or
-mixed if, in this log, the mean light of its exposure differs from the requested light by more than 0.1 % of full light.
-
-The camera needs at least two frame periods and one settling time per pair, which limits the rate. The order of the two
-images alternates from pair to pair, so the light is switched only once per pair: on in one pair, and off in the next
-pair. The limit is therefore computed with the mean of the settling times for on and off.
+A pair needs at least two frame periods and one settling time: the order of the two images alternates, so the light is
+switched only once per pair. This limits the rate.
 """
 
 import dataclasses
@@ -32,8 +25,8 @@ from typing import NamedTuple
 
 import tyro
 
-from benchmarks.instruments import sensor_peer, twin_peer
-from benchmarks.instruments.shown import Shown
+from benchmarks.instruments import peers, twin_peer
+from benchmarks.instruments.peers import Shown
 from sts_jax import hardware, storage
 
 SIZE = (640, 480)
@@ -46,11 +39,7 @@ LEAST = 0.8  # least required rate, as a share of the camera's limit
 
 @dataclasses.dataclass(frozen=True)
 class Args:
-    """Options of the command line.
-
-    Raises:
-        ValueError: `lags_ms` is empty, or `pairs` is smaller than the number of lags.
-    """
+    """Options of the command line."""
 
     pairs: int = 1000  # number of pairs of images, of all lags together
     lags_ms: tuple[float, ...] = (15, 30, 50, 80, 120)  # time from the end of an exposure to the sending (ms)
@@ -66,10 +55,7 @@ class Args:
 
 
 class Measured(NamedTuple):
-    """Results of reading pairs of images from an emulated camera that sends its frames with a lag.
-
-    The lag is the time from the end of an exposure to the sending of the frame.
-    """
+    """Results of reading pairs of images from an emulated camera that sends its frames with a lag."""
 
     lag_ms: float
     settling: hardware.Settling  # as `hardware.STS` measured it
@@ -92,20 +78,8 @@ class Measured(NamedTuple):
 
 
 def serve(link: multiprocessing.connection.Connection, path: Path, lag_s: float, twin: bool) -> None:
-    """Run the emulated devices in a process of their own, until the process that reads the images has finished.
-
-    Args:
-        link: Connection to the reading process. This function first sends the address of the camera. The reading
-            process then sends MOVE any number of times and FINISHED once. If `twin` is True, MOVE releases the object
-            if it is held, and holds the object if it is not held. If `twin` is False, MOVE has no effect. The answer to
-            FINISHED is the camera's log. The log maps the key of each image to the mean light during the exposure
-            (`Shown`). The key is a checksum of the pixels if `twin` is True, and the number of the frame if `twin` is
-            False.
-        path: Path at which a symbolic link to the controller's port is created.
-        lag_s: Time from the end of an exposure to the sending of the frame (s).
-        twin: True for images of the digital twin, a simulated sensor. False for images of one colour.
-    """
-    make: type[twin_peer.TwinPeer | sensor_peer.SensorPeer] = twin_peer.TwinPeer if twin else sensor_peer.SensorPeer
+    """Run the emulated devices in a process of their own, until the process that reads the images has finished."""
+    make: type[twin_peer.TwinPeer | peers.SensorPeer] = twin_peer.TwinPeer if twin else peers.SensorPeer
     peer = make(path, fps=FPS, lag_s=lag_s, exposure_s=EXPOSURE_S, size=SIZE)
     link.send(peer.url)
     while link.recv() == MOVE:
@@ -116,20 +90,13 @@ def serve(link: multiprocessing.connection.Connection, path: Path, lag_s: float,
 
 
 def measure(lag_ms: float, pairs: int, path: Path, *, twin: bool) -> Measured:
-    """Read pairs of images at one lag, and count the images that were exposed with a wrong or mixed light.
-
-    Args:
-        lag_ms: Time from the end of an exposure to the sending of the frame (ms).
-        pairs: Number of pairs of a visual and a tactile image.
-        path: Path at which a symbolic link to the controller's port is created.
-        twin: True for images of the digital twin, a simulated sensor. False for images of one colour.
-    """
+    """Read pairs of images at one lag, and count the images that were exposed with a wrong or mixed light."""
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
     process = context.Process(target=serve, args=(there, path, lag_ms / 1000, twin), daemon=True)
     process.start()
     url = here.recv()
-    key = twin_peer.key if twin else sensor_peer.key
+    key = twin_peer.key if twin else peers.key
     taken: list[tuple[int, float]] = []  # key of each image, and the share of light that it must have
     sequences: list[int] = []
     camera = hardware.CameraConfig(url, *SIZE, lock=False, buffer=8)
@@ -157,10 +124,7 @@ def measure(lag_ms: float, pairs: int, path: Path, *, twin: bool) -> Measured:
 
 
 def report(found: list[Measured]) -> str:
-    """Format the results as a table with a row for each lag of the emulated camera.
-
-    The lag is the time from the end of an exposure to the sending of the frame.
-    """
+    """Format the results as a table with a row for each lag of the emulated camera."""
     lines = ["lag (ms)  settling off, on (ms)  frames/s  pairs  wrong or mixed  pairs/s  limit  share  discarded  lost"]
     for row in found:
         settled = f"{1000 * row.settling.visual_s:.0f}, {1000 * row.settling.tactile_s:.0f}"
@@ -177,11 +141,7 @@ def report(found: list[Measured]) -> str:
 
 
 def measure_all(args: Args) -> list[Measured]:
-    """Read pairs of images from emulated cameras with the lags `args.lags_ms`, and return one result for each lag.
-
-    The lag is the time from the end of an exposure to the sending of the frame. All results together are from
-    `args.pairs` pairs, and each lag has about the same number of pairs.
-    """
+    """Read pairs of images from emulated cameras with the lags `args.lags_ms`, and return one result for each lag."""
     number = len(args.lags_ms)
     found = []
     with tempfile.TemporaryDirectory() as folder:
@@ -192,11 +152,7 @@ def measure_all(args: Args) -> list[Measured]:
 
 
 def main(args: Args) -> str:
-    """Read pairs of images from emulated cameras with different lags, and return a table of the results.
-
-    The option `--lags-ms` lists the lags. A lag is the time from the end of an exposure to the sending of the frame. If
-    `--out` is given, the table is also written to this file.
-    """
+    """Read pairs of images from emulated cameras with different lags, and return a table of the results."""
     found = measure_all(args)
     load = os.getloadavg()[1] if hasattr(os, "getloadavg") else float("nan")
     text = (

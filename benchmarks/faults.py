@@ -4,18 +4,11 @@
     python -m benchmarks.faults --out benchmarks/results/hardware/faults.txt    # also write the table
     python -m benchmarks.faults --number 20 --only black                        # one kind of fault
 
-A pair is a visual image (lights off) and a tactile image (lights on). No hardware is needed. The LED controller is
-emulated on a pseudo-terminal, and the camera on a local network port (`instruments/sensor_peer.py`). The emulated
-camera sees the lights of the controller. It has a random exposure time and a random lag, the time from the end of an
-exposure to the sending of the frame. Before each fault the program reads a pair. Then the fault begins at a random
-moment of a read. Reads continue until a pair has been read after the end of the fault.
-
-The emulated camera logs the light during each exposure. The program counts a received image as wrong if the log shows a
-wrong or mixed light for its exposure, or if the log has no such exposure. The settling time of the lights
-is the time from a switch to the first frame that shows only the new lights. An image is counted as old if the time from
-the beginning of its exposure to the beginning of the read was longer than the settling time.
-
-In the last kind of fault, a second process reads the pairs, and the second process is killed while a light is on.
+The LED controller is emulated on a pseudo-terminal, and the camera, which sees its lights, on a local network port.
+Exposure time and lag are random. A fault begins at a random moment of a read, and reads continue until a pair has been
+read after its end. A received image is wrong if the camera's log has a wrong or mixed light for its exposure, or no
+exposure. It is old if its exposure began longer before the read than the settling time. In the last kind of fault, a
+second process reads the pairs, and is killed while a light is on.
 """
 
 import contextlib
@@ -36,7 +29,7 @@ from pathlib import Path
 import tyro
 from serial.tools import list_ports_common
 
-from benchmarks.instruments.sensor_peer import SensorPeer
+from benchmarks.instruments.peers import SensorPeer
 from sts_jax import hardware, storage
 
 FPS = 60.0
@@ -58,11 +51,7 @@ RETURN_S = 12.0  # longest wait for a pair after a fault: the camera's backoff a
 
 @dataclasses.dataclass(frozen=True)
 class Args:
-    """Options of the command line.
-
-    Raises:
-        ValueError: `number` or `long` is out of range, or `only` contains an unknown kind of fault.
-    """
+    """Options of the command line."""
 
     number: int = 312  # number of faults
     seed: int = 0  # seed of the order, the times and the lengths of the faults
@@ -112,13 +101,7 @@ class Count:
 
 
 class Bench:
-    """The emulated camera and LED controller, and the `hardware.STS` that uses them.
-
-    Args:
-        folder: Folder for the links to the controller's ports.
-        draw: Source of all random times, lengths and choices.
-        long: Share of long faults (5 to 7 s) among the faults of variable length.
-    """
+    """The emulated camera and LED controller, and the `hardware.STS` that uses them."""
 
     def __init__(self, folder: Path, draw: random.Random, long: float):
         self.folder, self.draw, self.long = folder, draw, long
@@ -286,16 +269,7 @@ RECONNECTING = (
 
 
 def inject(bench: Bench, sensor: hardware.STS, kind: str, count: Count) -> None:
-    """Inject one fault, and try to read pairs of images until the first pair arrives after the end of the fault.
-
-    If no pair arrives in time (RETURN_S), the fault is not counted as recovered.
-
-    Args:
-        bench: The emulated devices.
-        sensor: The connected sensor.
-        kind: Kind of the fault, a name in `KINDS`.
-        count: Results for this kind of fault. This function updates them.
-    """
+    """Inject one fault, and try to read pairs of images until the first pair arrives after the end of the fault."""
     count.injected += 1
     count.limit_s = RECONNECTED_S if kind in RECONNECTING or kind.startswith(("answer", "request")) else READ_S
     _read(bench, sensor, count)
@@ -343,16 +317,7 @@ def _read(bench: Bench, sensor: hardware.STS, count: Count) -> bool:
 
 
 def host(path: str, url: str, width: int, height: int) -> None:
-    """Read pairs of images without end.
-
-    The function `kill` runs `host` in a second process, and kills the second process.
-
-    Args:
-        path: Port of the controller.
-        url: Address of the camera.
-        width: Width of the camera's images (pixels).
-        height: Height of the camera's images (pixels).
-    """
+    """Read pairs of images without end."""
     camera = hardware.CameraConfig(url, width, height, lock=False, buffer=8)
     settled = hardware.Settling(visual_s=0.15, tactile_s=0.15)
     leds = hardware.Leds.connect(path, watchdog_ms=WATCHDOG_MS)
@@ -424,19 +389,7 @@ def measure(args: Args) -> dict[str, Count]:
 
 
 def measure_part(order: list[str], seed: int, long: float) -> dict[str, Count]:
-    """Inject faults into one emulated sensor, whose camera has a random exposure time and a random lag.
-
-    The lag is the time from the end of an exposure to the sending of the frame.
-
-    Args:
-        order: Kind of each fault, in the order of injection. Faults of the kind KILLED, in which the reading process is
-            killed, always come last.
-        seed: Seed of all random numbers.
-        long: Share of long faults (5 to 7 s) among the faults of variable length.
-
-    Returns:
-        The results by kind.
-    """
+    """Inject faults into one emulated sensor, whose camera has a random exposure time and a random lag."""
     counts = {kind: Count() for kind in order}
     with tempfile.TemporaryDirectory() as folder:
         bench = Bench(Path(folder), random.Random(seed), long)

@@ -1,11 +1,7 @@
 """Waiting times of a new user (first image, another resolution, gradient, simulation), and frames/s of `jax.vmap`.
 
-    python -m benchmarks.first_hour            # about six minutes on two CPU cores
-    python -m benchmarks.first_hour --vmap     # only the rates of `jax.vmap` and `jax.lax.map`
-
-The waiting times are the seconds of each step in two new processes. The first process starts with an empty compilation
-cache, and the second one with the cache that the first one left. A rate is the number of frames or gradients per
-second, the median of seven calls with 32 poses at 64x64. Prints two tables and writes no files.
+python -m benchmarks.first_hour            # about six minutes on two CPU cores
+python -m benchmarks.first_hour --vmap     # only the rates of `jax.vmap` and `jax.lax.map`
 """
 
 import dataclasses
@@ -19,9 +15,8 @@ import numpy as np
 import tyro
 
 import sts_jax as sts
-from benchmarks.instruments import fresh
 from benchmarks.instruments.first_steps import CLASS
-from benchmarks.instruments.timing import in_turn
+from benchmarks.instruments.timing import fresh, in_turn
 
 FRAMES = 32
 
@@ -34,13 +29,9 @@ class Args:
 
 
 def waiting() -> None:
-    """Print how long each first step of a new user takes (s), such as the import and the first image.
-
-    The steps run in two new processes. The first process starts with an empty compilation cache, and the second one
-    with the cache that the first one left.
-    """
+    """Print how long each first step of a new user takes (s), such as the import and the first image."""
     with tempfile.TemporaryDirectory() as folder:
-        runs = [fresh.call("benchmarks.instruments.first_steps.stamps", cache=Path(folder)) for _ in range(2)]
+        runs = [fresh("benchmarks.instruments.first_steps.stamps", cache=Path(folder)) for _ in range(2)]
     print(f"{'seconds, each step by itself':<32}{'empty cache':>12}{'kept cache':>12}")
     before = [0.0, 0.0]
     for name in runs[0]:
@@ -83,10 +74,7 @@ def rates() -> None:
 
 
 def main(args: Args) -> None:
-    """Print how long a new user waits for the first results, and how many frames and gradients are computed per second.
-
-    The option `--vmap` leaves out the waiting times.
-    """
+    """Print the waiting times, and the frames and gradients per second."""
     if not args.vmap:
         waiting()
     rates()

@@ -3,20 +3,12 @@
     python -m benchmarks.gap                                                  # about ten minutes
     python -m benchmarks.gap --out benchmarks/results/gap/known.txt           # also write the table
 
-No hardware is needed. The digital twin with its default imperfections (noise, vignetting, leaking light, JPEG, fisheye
-lens) takes the place of the real sensor. A second twin ("clean") has almost no imperfections and takes the place of the
-simulation. Both twins run on a virtual clock with equal seeds, and the benchmark stops if their logs show different
-poses. The benchmark records two sessions, which are folders of images: `WORKDIR/device` with its sensor file
-`WORKDIR/sensor.json`, and `WORKDIR/clean`. After the benchmark, run this command to compare the two sessions (with the
-default `WORKDIR`):
+A twin with its default imperfections (noise, vignetting, leaking light, JPEG, fisheye lens) takes the place of the real
+sensor, and a "clean" twin with almost none that of the simulation. The first two rows of the table compare images that
+differ by chance only, and each further row compares clean images with the same images after a known change. To compare
+both recorded sessions:
 
     python -m experiments.gap --real runs/gap-twin/device --sensor runs/gap-twin --simulated runs/gap-twin/clean
-
-The first two rows of the benchmark's table compare images that differ by chance only. The first row compares the two
-halves of the clean session. For the second row, all default imperfections are added to two copies of the clean
-session, which then differ in the random noise only. Each further row compares the images of the clean session with the
-same images after a known change: one added imperfection or, in the last row, all default imperfections. The distances
-are the mean absolute error of the pixels, the energy distance of image features, and the accuracy of a classifier.
 """
 
 import contextlib
@@ -63,13 +55,7 @@ class Args:
 
 
 def make(seed: int, imperfections: twin.Imperfections, lens: hardware.Lens | None) -> twin.Twin:
-    """Make a digital twin on a virtual clock. The object on the pad is a photo camera, `objects.make(key, "camera")`.
-
-    Args:
-        seed: Seed of the object, its motion and the noise.
-        imperfections: Imperfections of the twin's images.
-        lens: Fisheye lens of the twin. None: a pinhole.
-    """
+    """Make a twin on a virtual clock, with a photo camera on the pad."""
     sensor = sts.Sensor()
     scene = twin.ObjectScene(
         sts.objects.make(jax.random.key(seed), "camera"), resolution=SIZE, motion_rate=MOTION_RATE, seed=seed
@@ -79,14 +65,7 @@ def make(seed: int, imperfections: twin.Imperfections, lens: hardware.Lens | Non
 
 
 def read_pair(device: twin.Twin) -> tuple[hardware.Pair, tuple[float, ...]]:
-    """Take a visual and a tactile image of an unmoving object, with a digital twin (a simulated sensor).
-
-    Returns:
-        The visual and the tactile image, and the object's pose (7 numbers) from the twin's log.
-
-    Raises:
-        AssertionError: The light changed during an exposure, or the object moved between the two images.
-    """
+    """Take a visual and a tactile image of an unmoving object, with a digital twin (a simulated sensor)."""
     shots, poses = [], []
     streams: tuple[tuple[Literal["visual", "tactile"], tuple[int, ...], float], ...] = (
         ("visual", OFF, 0.0),
@@ -111,11 +90,7 @@ def read_pair(device: twin.Twin) -> tuple[hardware.Pair, tuple[float, ...]]:
 
 
 def release(device: twin.Twin) -> None:
-    """Let the object go, and wait until it is at rest.
-
-    Raises:
-        AssertionError: The object is still moving `LONGEST_S` seconds after the release.
-    """
+    """Let the object go, and wait until it is at rest."""
     device.command("release")
     until_s = device.now_s + LONGEST_S
     while device.state.phase != twin.Phase.STILL:
@@ -126,12 +101,7 @@ def release(device: twin.Twin) -> None:
 
 @contextlib.contextmanager
 def recording(folder: Path, note: str) -> Iterator[hardware.Session]:
-    """Open a session in a folder for the duration of a `with` block. All images have been written when the block ends.
-
-    Args:
-        folder: Folder of the session.
-        note: Description of the session, which is stored with it.
-    """
+    """Open a session, whose images have all been written when the `with` block ends."""
     origin = hardware.Origin(note, "TWIN", SIZE[1], SIZE[0], ON)
     with hardware.Session(folder, origin) as session:
         yield session
@@ -139,24 +109,7 @@ def recording(folder: Path, note: str) -> Iterator[hardware.Session]:
 
 
 def record(device: twin.Twin, folder: Path, count: int, note: str, bar: Bar) -> list[tuple[float, ...]]:
-    """Record trajectories of a digital twin (a simulated sensor).
-
-    A trajectory consists of two pairs of images. A pair is a visual and a tactile image. The first pair shows the held
-    object, and the second pair shows the object at rest.
-
-    Args:
-        device: The twin.
-        folder: Folder of the session.
-        count: Number of trajectories.
-        note: Name of the session, for its description and the progress bar.
-        bar: Progress bar.
-
-    Returns:
-        The pose of the object (7 numbers) for each pair, from the twin's log.
-
-    Raises:
-        ValueError: The folder has confirmed trajectories already.
-    """
+    """Record trajectories of a digital twin (a simulated sensor)."""
     poses = []
     with recording(folder, note) as session:
         if session.confirmed:
@@ -182,15 +135,7 @@ def record(device: twin.Twin, folder: Path, count: int, note: str, bar: Bar) -> 
 
 
 def sessions(args: Args) -> hardware.Recordings:
-    """Record the sessions `device` and `clean`, save the sensor file of `device`, and return the recordings of `clean`.
-
-    A session is a folder of images that a digital twin (a simulated sensor) has recorded. The twin of the session
-    `device` has the default imperfections and a fisheye lens. The twin of the session `clean` has almost no
-    imperfections.
-
-    Raises:
-        AssertionError: The poses of the object differ between the two sessions.
-    """
+    """Record both sessions, save the sensor file of `device`, and return the recordings of `clean`."""
     lens = hardware.Lens.ideal(SIZE[1], SIZE[0])
     poses = []
     with Bar() as bar:
@@ -218,10 +163,7 @@ def sessions(args: Args) -> hardware.Recordings:
 
 @dataclasses.dataclass(frozen=True)
 class Difference:
-    """A change that the benchmark applies to clean images: imperfections of a camera, and optionally a fisheye lens.
-
-    Clean images are images of a digital twin that has almost no imperfections.
-    """
+    """A change that the benchmark applies to clean images: imperfections of a camera, and optionally a fisheye lens."""
 
     name: str  # title of the row in the table
     imperfections: twin.Imperfections = CLEAN
@@ -230,12 +172,7 @@ class Difference:
 
 
 def levels(field: str, values: tuple[Any, ...]) -> list[Difference]:
-    """Make a list of imperfect cameras, which differ from an almost perfect camera in a single imperfection.
-
-    Args:
-        field: Field of `twin.Imperfections`, such as "vignetting". The other fields are as in `CLEAN`.
-        values: Values of the field, one for each camera.
-    """
+    """Make a list of imperfect cameras, which differ from an almost perfect camera in a single imperfection."""
     return [Difference(f"{field} {value:g}", dataclasses.replace(CLEAN, **{field: value})) for value in values]
 
 
@@ -252,14 +189,7 @@ DIFFERENCES = (
 
 
 def changed(clean: gap.Streams, difference: Difference, resolution: tuple[int, int], seed: int) -> gap.Streams:
-    """Change clean images as an imperfect camera would: add imperfections, distort and resize the images.
-
-    Args:
-        clean: Images of a twin that has almost no imperfections, at the resolution of the twin's camera, uint8.
-        difference: The imperfections to add, and whether the images are distorted as by a fisheye lens.
-        resolution: Height and width of the result (pixels).
-        seed: Seed of the noise.
-    """
+    """Change clean images as an imperfect camera would: add imperfections, distort and resize the images."""
     sensor, (height, width) = sts.Sensor(), clean.visual.shape[1:3]
     lens = hardware.Lens.ideal(width, height)
     blender = photometry.Blender(
@@ -288,14 +218,7 @@ def reduced(image: np.ndarray, resolution: tuple[int, int]) -> np.ndarray:
 
 
 def row(name: str, first: gap.Streams, second: gap.Streams, *, matched: bool) -> str:
-    """Format a row of the table: the distances between two sets of images, for both streams.
-
-    Args:
-        name: Name of the row.
-        first: First set.
-        second: Second set.
-        matched: True if both sets show the same scenes in the same order, so that their pixels can be compared.
-    """
+    """Format a row of the table: the distances between two sets of images, for both streams."""
     words = [f"{name:36s}"]
     for stream in ("visual", "tactile"):
         one, two = getattr(first, stream), getattr(second, stream)
@@ -310,12 +233,7 @@ def row(name: str, first: gap.Streams, second: gap.Streams, *, matched: bool) ->
 
 
 def table(clean: gap.Streams, resolution: tuple[int, int]) -> Iterator[str]:
-    """Yield the lines of the table of differences between clean images and changed copies of these images.
-
-    Args:
-        clean: Images without imperfections, at the resolution of the twin's camera.
-        resolution: Height and width at which images are compared (pixels).
-    """
+    """Yield the lines of the table of differences between clean images and changed copies of these images."""
     visual, tactile = (np.stack([reduced(image, resolution) for image in images]) for images in clean[:2])
     shown = gap.Streams(visual, tactile, clean.group)
     columns = f"{'MAE':>6s} {'energy':>7s} ({'p':^5s})  accuracy [95 %]  "
@@ -332,15 +250,7 @@ def table(clean: gap.Streams, resolution: tuple[int, int]) -> Iterator[str]:
 
 
 def main(args: Args) -> None:
-    """Record the image folders `device` and `clean`, then print the table of distances between sets of images.
-
-    Both folders contain images of the same scenes. The images of `device` have the default imperfections of the digital
-    twin, and the images of `clean` have almost none. The table uses the images of `clean` only, and compares them with
-    each other and with changed copies. The command `python -m experiments.gap` can compare `device` with `clean`.
-
-    Raises:
-        ValueError: An option is out of range, or the work directory contains confirmed trajectories already.
-    """
+    """Record the image folders `device` and `clean`, then print the table of distances between sets of images."""
     if args.trajectories < 2 * gap.FOLDS:
         raise ValueError(
             f"--trajectories must be >= {2 * gap.FOLDS}, so that two halves of the trajectories can be compared, "

@@ -5,32 +5,16 @@
     python -m benchmarks.hidden --keep FOLDER   # keep the starts and outcomes in a folder, and resume from this folder
     python -m benchmarks.hidden outcomes truth --scenario inclined --soaked FOLDER  # load stored trajectories
 
-Hidden properties are those that a camera cannot see, such as the fill level of a bottle. A start is the initial state
-of a trajectory. The outcome is how the trajectory ends, such as by toppling. The scenario `perturbed` is the jerked
-pad: a bottle stands on a pad that accelerates sideways for a short time. The scenario `inclined` is the slope: an
-object starts on a tilted pad or just above it. The parts are:
+- `outcomes`: the share of each outcome, and the share of the starts whose outcome changes with other contents.
+- `truth`: the log losses of two classifiers of the outcome, and the gain from the first to the second. The inputs of
+  the first are the exact shape, the first pose and the jerk (on the slope, with the noise `slope_features.SEEN`). The
+  second also gets a noisy measurement of touch: the weight on the jerked pad, the centre of pressure on the slope.
+- `pictures`: as `truth`, but a small network estimates the measurement of touch from the first uint8 tactile image.
+- `fill`: the AUCs of networks that separate objects that are more than half full from emptier ones, from tactile images
+  of standing objects, from visual images in the air, and from the same with a tint on the fuller objects, which shows
+  that such a network detects a visible difference. For the jerked pad only.
 
-- `outcomes`: the share of each outcome, and the share of the starts whose outcome changes if the hidden contents are
-  replaced at random and all else stays the same. The random values are the fill level and, on the slope, also the side
-  on which the contents lie.
-- `truth`: the log losses of two classifiers of the outcome, and the gain, which is the relative decrease of the loss
-  from the first classifier to the second. On the jerked pad, the inputs of the first classifier are the exact shape,
-  the first pose and the jerk. On the slope, the inputs are the exact shape and the first pose with the noise of an
-  estimate from images (`slope_features.SEEN`). The second classifier has a noisy measurement of touch as a further
-  input: the weight on the jerked pad, or the centre of pressure on the slope.
-- `pictures`: as `truth`, but a small network estimates the measurement of touch from the first uint8 tactile image. The
-  network is trained on other objects.
-- `fill`: the AUCs of three small networks that separate objects that are more than half full from emptier objects. The
-  first network sees tactile images of the standing objects. The second network sees visual images of the objects in the
-  air. The third network sees the same visual images, but with a tint on the fuller objects. Its AUC shows whether such
-  a network detects a visible difference. This part exists for the jerked pad only.
-
-Cross-validation folds and bootstrap samples (for 95 % intervals) contain all starts of an object or none. The starts
-are simulated with the defaults of the scenario. All results are printed. The features of the classifiers are in
-`benchmarks.instruments`.
-
-With `--soaked FOLDER`, the command does not simulate the starts, but loads the trajectories that
-`benchmarks.soak --keep FOLDER` has stored.
+Cross-validation folds and bootstrap samples (for 95 % intervals) contain all starts of an object or none.
 """
 
 import dataclasses
@@ -105,12 +89,7 @@ STUDIES = {
 
 @dataclasses.dataclass(frozen=True)
 class Args:
-    """Options of the command line.
-
-    Raises:
-        ValueError: A requested part of the report does not exist for the scenario. Or `soaked`, a folder of simulated
-            trajectories, is combined with `objects`, `again` or `keep`, which are options for a new simulation.
-    """
+    """Options of the command line."""
 
     parts: tyro.conf.Positional[tuple[Part, ...]] = ()  # parts of the printed report (default: all for the scenario)
     scenario: Literal["perturbed", "inclined"] = "perturbed"  # the jerked pad, or the slope
@@ -135,13 +114,7 @@ class Args:
 
 
 def outcomes(study: Study, starts: Starts) -> None:
-    """Print the share of each outcome, of unsettled starts, and of starts whose outcome depends on the hidden contents.
-
-    A start is the initial state of a trajectory. The outcome is how the trajectory ends, such as by toppling. A start
-    is unsettled if its object lies on the pad at the end of the trajectory but has not come to rest. For the last
-    share, some of the trajectories were simulated again from the same starts, but with other random contents. The new
-    contents have another fill level and, in the scenario `inclined`, another place inside the object.
-    """
+    """Print the shares of the outcomes, of unsettled starts, and of starts whose outcome changes with the contents."""
     share = functools.partial(classifier.interval, classifier.mean, groups=starts.body)
     for outcome in study.scenario.outcomes:
         print(f"{outcome.name.lower():30s} {share(starts.outcome == outcome)}")
@@ -155,34 +128,14 @@ def outcomes(study: Study, starts: Starts) -> None:
 
 
 def losses(study: Study, items: list[objects.Body], starts: Starts, touch: np.ndarray | None) -> np.ndarray:
-    """Compute the log loss of a classifier that predicts how trajectories end, such as by toppling.
-
-    Args:
-        study: Settings of the scenario.
-        items: The objects.
-        starts: Initial states and outcomes of trajectories of these objects, with one row for each trajectory.
-        touch: Quantity that the sense of touch determines, such as the logarithm of the mass, `(n, k)`, nan without
-            contact. None: the classifier has vision only.
-
-    Returns:
-        The loss of each trajectory, `(n,)`, from a classifier that was fitted to other objects.
-    """
+    """Compute the log loss of a classifier that predicts how trajectories end, such as by toppling."""
     label = np.searchsorted(np.sort(study.scenario.outcomes), starts.outcome)
     features = study.features(study.scenario, items, starts, touch)
     return metrics.log_loss(classifier.probabilities(features, label, starts.body), label)
 
 
 def gains(study: Study, items: list[objects.Body], starts: Starts, read: np.ndarray | None) -> None:
-    """Print the log losses of classifiers that predict the outcome without and with touch, and the gain.
-
-    The gain is the relative decrease of the log loss through touch.
-
-    Args:
-        study: Settings of the scenario.
-        items: The objects.
-        starts: Initial states and outcomes of these objects' trajectories, with one row for each trajectory.
-        read: Result of `pictures`: estimates from tactile images, `(n, k)`. None: print no lines for these estimates.
-    """
+    """Print the log losses of classifiers that predict the outcome without and with touch, and the gain."""
     exact = study.touch(starts)
     rough = exact + study.noise * np.random.default_rng(0).normal(size=exact.shape)
     interval = functools.partial(classifier.interval, groups=starts.body)
@@ -202,36 +155,14 @@ def gains(study: Study, items: list[objects.Body], starts: Starts, read: np.ndar
 
 
 def lesson(study: Study, items: list[objects.Body], starts: Starts, others: int) -> Lesson:
-    """Render tactile images of training objects and of the objects under study.
-
-    Networks are trained on the images of the training objects, and are then applied to the images under study.
-
-    Args:
-        study: Settings of the scenario.
-        items: The objects under study.
-        starts: Starts of the objects under study, with one row for each start.
-        others: Number of training objects.
-    """
+    """Render tactile images of training objects and of the objects under study."""
     rest = bodies(study.categories, others, OTHERS)
     learned = roll(jax.random.key(1), rest, dataclasses.replace(study.scenario, frames=1), EXAMPLES)
     return Lesson(rest, learned, draw(rest, learned)[1], draw(items, starts)[1])
 
 
 def pictures(study: Study, learned: Lesson, starts: Starts, steps: int) -> np.ndarray:
-    """Train a network on tactile images, and return its estimates of the mass or of the centre of pressure.
-
-    The network estimates the logarithm of the mass in the scenario of the jerked pad, and the centre of pressure in the
-    scenario of the slope.
-
-    Args:
-        study: Settings of the scenario.
-        learned: Training data of the network, and the images under study.
-        starts: Initial states of trajectories, in the order of the images under study.
-        steps: Training steps of the network.
-
-    Returns:
-        The estimates for the images under study, `(n, k)`, nan without contact.
-    """
+    """Train a network on tactile images, and return its estimates of the mass or of the centre of pressure."""
     touch = study.touch(learned.starts)
     known = np.isfinite(touch).all(1)
     read = cnn.fit(jax.random.key(0), learned.examples[known], touch[known], steps=steps)(learned.tactile)
@@ -244,17 +175,7 @@ def painted(body: objects.Body) -> objects.Body:
 
 
 def aloft(key: PRNGKeyArray, items: list[objects.Body], num: int) -> tuple[Starts, np.ndarray, np.ndarray]:
-    """Render objects in the air at the start of a fall.
-
-    Args:
-        key: Random key.
-        items: The objects.
-        num: Number of falls of each object.
-
-    Returns:
-        The starts of the falls, their visual images, and the same images with a tint (`painted`) on all objects that
-        are more than half full. The images are uint8 `(n, 64, 64, 3)` each.
-    """
+    """Render objects in the air at the start of a fall."""
     starts = roll(key, items, physics.Freefall(frames=11), num)  # 11 frames are the minimum of the scenario
     plain, _ = draw(items, starts)
     both, _ = draw([painted(body) for body in items], starts)
@@ -262,18 +183,7 @@ def aloft(key: PRNGKeyArray, items: list[objects.Body], num: int) -> tuple[Start
 
 
 def detect(name: str, images: np.ndarray, starts: Starts, new: np.ndarray, held_out: Starts, steps: int) -> None:
-    """Train a network to detect whether the object in an image is more than half full, and print its AUC.
-
-    The AUC is computed for the images of held-out objects.
-
-    Args:
-        name: Name of the images, for the printed line.
-        images: Training images, uint8 `(n, h, w, 3)`.
-        starts: Initial states that the training images show, with the fill of each object.
-        new: Images of held-out objects, uint8 `(m, h, w, 3)`.
-        held_out: Initial states that the held-out images show, with the fill of each object.
-        steps: Training steps of the network.
-    """
+    """Train a network to detect whether the object in an image is more than half full, and print its AUC."""
     read = cnn.fit(jax.random.key(1), images, starts.fill[:, None] > 0.5, steps=steps)
     label, score = held_out.fill > 0.5, read(new)[:, 0]
     figure = classifier.interval(metrics.auc, label, score, groups=held_out.body)
@@ -281,19 +191,7 @@ def detect(name: str, images: np.ndarray, starts: Starts, new: np.ndarray, held_
 
 
 def fill(learned: Lesson, items: list[objects.Body], starts: Starts, num: int, steps: int) -> None:
-    """Print the AUCs of three networks that detect whether an object is more than half full.
-
-    The first network sees tactile images of standing objects. The second network sees visual images of objects in the
-    air. The third network sees the same visual images, but with a tint on all objects that are more than half full.
-    The result of the third network shows whether such a network detects a change that is visible.
-
-    Args:
-        learned: Training data, and the tactile images under study.
-        items: The objects under study.
-        starts: Initial states of the objects' trajectories, in the order of the tactile images under study.
-        num: Number of visual images of each object under study.
-        steps: Training steps of the networks.
-    """
+    """Print the AUCs of three networks that detect whether an object is more than half full."""
     detect("touch, standing", learned.examples, learned.starts, learned.tactile, starts, steps)
     flying, plain, tinted = aloft(jax.random.key(2), learned.items, EXAMPLES)
     new, new_plain, new_tinted = aloft(jax.random.key(3), items, num)
@@ -302,11 +200,7 @@ def fill(learned: Lesson, items: list[objects.Body], starts: Starts, num: int, s
 
 
 def begun(study: Study, args: Args) -> tuple[list[objects.Body], Starts]:
-    """Return the objects, and the initial states and outcomes of their trajectories.
-
-    If `args.soaked` is a folder, the trajectories are loaded from this folder. Otherwise, they are simulated, unless
-    the folder `args.keep` already contains them.
-    """
+    """Return the objects, and the initial states and outcomes of their trajectories."""
     if args.soaked is not None:
         starts = blocks.soaked(args.soaked, args.scenario)
         return bodies(study.categories, int(starts.body.max()) + 1), starts

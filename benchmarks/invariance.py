@@ -4,29 +4,22 @@
     python -m benchmarks.invariance --num 300   # about 5 minutes
     python -m benchmarks.invariance --only jerked-bottles
 
-There are three cases. In the first two, a box or a bottle is released 20 mm above the pad in any orientation, and each
-run is labelled by the face that is down at the end. In the third case, bottles stand on a pad that is jerked sideways
-(`physics.Perturbed`), and each run is labelled by its outcome, such as "topples". Each case is computed in several
-ways, which are called sides:
+A box or a bottle is released 20 mm above the pad in any orientation (label of a run: the face that is down at the end),
+or bottles stand on a jerked pad (label: the outcome). Each case is computed in several ways, called sides:
 
 - "ours": `simulate` with MJX
 - the same with half the time step
 - the same with start, jerk and object mirrored
 - the three sides above with C MuJoCo, instead of MJX, as the engine of `simulate`
-- "C MuJoCo": C MuJoCo without `simulate`. The contacts are those that C MuJoCo itself finds for the mesh
-- "C, every vertex": as "C MuJoCo", but with a contact sphere at every vertex of the hull. The hull itself also has
-  contacts, but these act only where a rim of the pad touches the hull between the vertices
+- "C MuJoCo": C MuJoCo without `simulate`. The contacts are those that C MuJoCo itself finds for the mesh: at most four
+  for a mesh that stands on a face. A round base becomes a square that is up to 30 % narrower, and rocks and walks more
+- "C, every vertex": as "C MuJoCo", but with a contact sphere at every vertex of the hull, as on the side "ours". The
+  hull itself has contacts only where a rim of the pad touches it between the vertices
 - "C, every vertex, driven pad", for jerked bottles only: the same, but the pad is accelerated on slide joints under
   constant gravity. On all other sides, the pad is fixed and the jerk is a change of gravity
 
-On the side "C MuJoCo", a mesh that stands on a face has at most four contacts. A round base thus becomes a square that
-is up to 30 % narrower, and rocks and walks more. With a contact at every vertex, C MuJoCo has the same contacts as the
-side "ours".
-
-The command prints the share of each label on all sides. For each side other than "ours", it also prints the 95 %
-interval of the difference from "ours". All sides have the same starts and hidden properties (such as friction), so each
-run on the side "ours" is paired with a run on each of the other sides. The interval is computed for paired proportions
-(Agresti and Min 2005, with half a count added to each cell). The command writes no files.
+The command prints the share of each label on all sides, with the 95 % interval of the difference from "ours". Runs are
+paired by their start and hidden properties (Agresti and Min 2005, with half a count added to each cell).
 """
 
 import concurrent.futures
@@ -161,19 +154,7 @@ def roll(
     seed: int = 0,
     engine: physics.Engine = "mjx",
 ) -> physics.Trajectory:
-    """Simulate trajectories of a case, which consists of a scenario and bodies.
-
-    Args:
-        case: The case.
-        num: Number of trajectories, rounded up to a multiple of the number of bodies.
-        bodies: Bodies that replace the case's bodies (default: no replacement).
-        scenario: A scenario that replaces the case's scenario (default: no replacement).
-        seed: Seed of starts and hidden properties, such as friction.
-        engine: Engine of `simulate`.
-
-    Returns:
-        The trajectories, as NumPy arrays.
-    """
+    """Simulate trajectories of a case, which consists of a scenario and bodies."""
     items = list(case.bodies if bodies is None else bodies)
     each = -(-num // len(items))
     with tqdm(total=each * len(items), desc=case.name, leave=False, disable=None) as bar:
@@ -197,15 +178,7 @@ def halved(scenario: physics.Freefall | physics.Perturbed) -> physics.Freefall |
 
 
 def c_model(body: objects.Body, contact: physics.Contact, every_vertex: bool, driven: bool) -> mujoco.MjModel:
-    """Compile the scene for C MuJoCo.
-
-    Args:
-        body: The object.
-        contact: Constants of the contact.
-        every_vertex: Add a contact sphere at every vertex of the hull. Otherwise, the only contacts are those that C
-            MuJoCo finds for the mesh.
-        driven: Give the pad two slide joints, along x and y. Otherwise the pad is fixed.
-    """
+    """Compile the scene for C MuJoCo."""
     gel, parts = Sensor().gel.size, np.asarray(body.hulls)
     xml = scene.scene_xml(parts, (float(gel[0]), float(gel[1])), contact)
     if driven:
@@ -225,18 +198,7 @@ def c_model(body: objects.Body, contact: physics.Contact, every_vertex: bool, dr
 
 
 def last_in_c(case: Case, traj: physics.Trajectory, *, every_vertex: bool = False, driven: bool = False) -> np.ndarray:
-    """Simulate given trajectories again, from their first frames, in C MuJoCo.
-
-    Args:
-        case: Scenario and bodies of the trajectories.
-        traj: Trajectories of the case. Their starts and hidden properties, such as friction, are used.
-        every_vertex: Add a contact sphere at every vertex of the hull.
-        driven: If True, only the vertical part of the scenario's gravity acts, and the pad accelerates with the
-            negative of the horizontal part. If False, the pad is fixed, and the whole gravity of the scenario acts.
-
-    Returns:
-        The last poses in the pad's frame, `(n, 7)`.
-    """
+    """Simulate given trajectories again, from their first frames, in C MuJoCo."""
     scenario = case.scenario
     times = np.arange(scenario.steps * (scenario.frames - 1)) * scenario.contact.timestep
     gravities = jax.jit(jax.vmap(jax.vmap(scenario.gravity, (0, None)), (None, 0)))
@@ -277,50 +239,19 @@ def last_in_c(case: Case, traj: physics.Trajectory, *, every_vertex: bool = Fals
 
 
 def named(case: Case, first: Array | np.ndarray, last: Array | np.ndarray) -> np.ndarray:
-    """Label the runs of a case. The label of a run names the state at its end.
-
-    Args:
-        case: The case of the runs.
-        first: Pose at the start of each run, `(n, 7)`.
-        last: Pose at the end of each run, `(n, 7)`.
-
-    Returns:
-        Index in `case.labels` for each run, `(n,)`.
-    """
+    """Label the runs of a case. The label of a run names the state at its end."""
     return np.asarray(jax.vmap(case.label)(jnp.asarray(first), jnp.asarray(last)))
 
 
 def difference(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
-    """Return the 95 % confidence interval of the difference between the shares of one label in two sets of runs.
-
-    The label of a run names the state at its end. The share of a label is the fraction of the runs that have this
-    label. Run i of the first set is paired with run i of the second set.
-
-    Args:
-        a: True for the runs of the first set that have the label, `(n,)`.
-        b: True for the runs of the second set that have the label, `(n,)`.
-
-    Returns:
-        Middle and half width of the interval of `mean(b) - mean(a)`.
-    """
+    """Return the 95 % confidence interval of the difference between the shares of one label in two sets of runs."""
     gained, lost, count = np.sum(b & ~a) + 0.5, np.sum(a & ~b) + 0.5, len(a) + 2
     middle = (gained - lost) / count
     return middle, 1.96 * math.sqrt((gained + lost) / count - middle**2) / math.sqrt(count)
 
 
 def sides(case: Case, num: int) -> dict[str, np.ndarray]:
-    """Simulate a case in several ways, such as with MJX and with C MuJoCo, and label each run by its final state.
-
-    These ways are called sides. The docstring of the module describes them.
-
-    Args:
-        case: The scenario, the objects and the possible labels.
-        num: Number of runs on each side.
-
-    Returns:
-        A dictionary from the name of each side to the indices of the runs' labels in `case.labels`. The first side is
-        "ours".
-    """
+    """Simulate a case in several ways, such as with MJX and with C MuJoCo, and label each run by its final state."""
     other_hand = [objects.mirror(body) for body in case.bodies]
     rolled: dict[str, physics.Trajectory] = {}
     sides_of: dict[str, physics.Engine] = {"ours": "mjx", "simulate in C": "mujoco"}
@@ -346,21 +277,7 @@ def sides(case: Case, num: int) -> dict[str, np.ndarray]:
 
 
 def compare(found: dict[str, np.ndarray], labels: Sequence[str], margin: float = MARGIN) -> bool:
-    """Print how often the runs end in each way, and compare the side "ours" with each of the other sides.
-
-    A side is one way to compute the same runs, such as another time step or another physics engine. The label of a run
-    states how the run ends, such as "lies". The share of a label on a side is the share of the runs with this label.
-    For each label, the function compares its share on "ours" with its share on each of the other sides. It prints both
-    shares and the 95 % confidence interval of their difference.
-
-    Args:
-        found: Index of the label of every run, by name of the side. The side "ours" must be the first.
-        labels: The labels.
-        margin: Limit for the absolute values of both ends of each interval.
-
-    Returns:
-        True if all intervals lie within the margin.
-    """
+    """Print how often the runs end in each way, and compare the side "ours" with each of the other sides."""
     ours, within = found["ours"], True
     for side, theirs in list(found.items())[1:]:
         print(f"    {side}: {100 * np.mean(ours == theirs):.1f} % of the runs end alike")
@@ -378,11 +295,7 @@ def compare(found: dict[str, np.ndarray], labels: Sequence[str], margin: float =
 
 
 def main(args: Args) -> None:
-    """Simulate each case in several ways, and print a comparison of the results.
-
-    The ways, such as half the time step or the engine C MuJoCo, are called sides and are listed in the docstring of the
-    module. With `--only`, a single case is simulated.
-    """
+    """Simulate each case in several ways, and print a comparison of the results."""
     within = [compare(sides(case, args.num), case.labels) for case in cases() if args.only in (None, case.name)]
     print(f"every interval within {100 * MARGIN:.0f} points: {'yes' if all(within) else 'NO'}")
 

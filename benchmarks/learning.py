@@ -4,16 +4,8 @@
     python -m benchmarks.learning --only statespace  # one kind of model
     taskset -c 0 python -m benchmarks.learning       # on one core
 
-The first line of the output has the name of the device. The second line has the time of a training step of the paper's
-model (`mvae`) for freefall at batch 64. This model has the modalities vision, touch and pose. Touch is never an input,
-so the model predicts all modalities from each subset of vision and pose. The same line has the time of a plain
-implementation, which masks touch in all samples, enumerates all seven subsets of the three modalities, and uses XLA's
-convolutions and transposed convolutions. The next lines have the times of training steps with smaller batches, of a
-training step with vision alone, and of a prediction at batch 1. The last lines have the times of a training step of the
-state-space model for freefall, and of a prediction with 16 samples.
-
-All times are medians of several calls. The calls of the paper's model and of its plain implementation alternate. Each
-function is called once before its measured calls. The command writes no files.
+The plain implementation masks touch in all samples, enumerates all seven subsets of the three modalities, and uses
+XLA's convolutions and transposed convolutions. All times are medians of several calls.
 """
 
 import dataclasses
@@ -63,13 +55,7 @@ def plain_conv_transpose(x: Array, kernel: Array, stride: int, padding: int) -> 
 
 
 def stepper(model: mvae.Config, size: int, absent: tuple[str, ...]) -> Callable[[], None]:
-    """Make a function that runs one compiled training step of an `mvae` model on random data.
-
-    Args:
-        model: The model.
-        size: Batch size.
-        absent: Modalities that are targets and never inputs.
-    """
+    """Make a function that runs one compiled training step of an `mvae` model on random data."""
     rng = np.random.default_rng(0)
     data: dict[str, Any] = {
         m.name: rng.integers(0, 256, (size, *m.shape), dtype=np.uint8)
@@ -94,11 +80,7 @@ def stepper(model: mvae.Config, size: int, absent: tuple[str, ...]) -> Callable[
 
 
 def predictor(size: int) -> Callable[[], None]:
-    """Make a function that predicts all modalities of `MODEL` for a fixed batch of visual images, in one compiled call.
-
-    Args:
-        size: Batch size.
-    """
+    """Make a function that predicts all modalities of `MODEL` from a fixed batch of visual images."""
     graphdef, params, stats = mvae.init(jax.random.key(0), MODEL)
     state = nnx.merge_state(params, stats)
     run = jax.jit(lambda state, x: mvae.predict(graphdef, state, {"visual": x}))
@@ -107,13 +89,7 @@ def predictor(size: int) -> Callable[[], None]:
 
 
 def state_stepper(size: int) -> Callable[[], None]:
-    """Make a function that runs one compiled training step of a state-space model on random data.
-
-    The model has the default configuration.
-
-    Args:
-        size: Batch size.
-    """
+    """Make a function that runs one compiled training step of a state-space model on random data."""
     rng, model = np.random.default_rng(0), statespace.Config()
     config = training.TrainConfig(batch_size=size)
 
@@ -149,13 +125,7 @@ def state_stepper(size: int) -> Callable[[], None]:
 
 
 def state_predictor(num_samples: int) -> Callable[[], None]:
-    """Make a function without arguments that computes one prediction, to measure its duration.
-
-    The input of the prediction is one visual image. The model is a state-space model with random weights.
-
-    Args:
-        num_samples: Number of samples of the prediction.
-    """
+    """Make a function without arguments that computes one prediction, to measure its duration."""
     config = statespace.Config()
     graphdef, params, _ = statespace.init(jax.random.key(0), config)
     view = training.Preprocessing(resolution=(config.input_size, config.input_size))

@@ -1,14 +1,10 @@
-"""Skill of the library's trained models on images of the digital twin.
+"""Skill of the library's trained models on images of the twin, as `experiments.live` predicts them.
 
     python -m benchmarks.live
 
-In the digital twin, a hand holds an object in an unstable pose and lets go. Each model predicts the images of the
-object at rest from the images of the held object, as `experiments.live` does. The command prints the skill of the
-predicted images: one number for all trajectories together, computed from mean squared errors. The skill is 1 if each
-predicted image equals the true last image. It is 0 if the prediction for each trajectory is the mean of the last images
-of all other trajectories. No model was trained with the twin's noise, vignetting and leaking light. The twin's object
-moves as in the scenario `physics.Released`. Only the model `released` was trained on this scenario, with objects of the
-same class as the twin's object.
+The skill of all trajectories together is 1 - mean squared error / mean squared error of the mean last image of the
+other trajectories. No model was trained with the twin's noise, vignetting and leaking light, and only the model
+`released` was trained on the twin's scenario.
 """
 
 import dataclasses
@@ -40,12 +36,7 @@ class Args:
 
 
 def collect(args: Args) -> tuple[Pair, list[Pair], list[Pair]]:
-    """Record trajectories of the digital twin.
-
-    Returns:
-        A pair of images of the empty pad, a list of pairs of the held object, and a list of pairs of the object at
-        rest. A pair is a visual and a tactile image. Each list has one pair per trajectory.
-    """
+    """Record trajectories of the digital twin."""
     # The images during the motion are not read, so one pose per second of the motion is rendered.
     with make_twin(TwinConfig(motion_rate=1.0, seed=args.seed)) as device:
 
@@ -73,20 +64,7 @@ def collect(args: Args) -> tuple[Pair, list[Pair], list[Pair]]:
 def seen(
     views: Views, predictor: sts.Predictor, pairs: list[Pair], index: int, size: tuple[int, int] | None = None
 ) -> np.ndarray:
-    """Convert the visual or the tactile images of some pairs to inputs of a model.
-
-    Args:
-        views: Conversion from raw images of the digital twin (a simulated sensor) to the view of the pinhole camera
-            `Sensor.camera`.
-        predictor: The model.
-        pairs: List of `n` pairs. A pair is a visual and a tactile raw image of the digital twin.
-        index: 0 for the visual stream, 1 for the tactile stream.
-        size: Height and width of the result, divisors of the height and width of the model's inputs. Each pixel is the
-            mean of a block of pixels. Default: the size of the model's inputs.
-
-    Returns:
-        Images in [0, 1], `(n, height, width, 3)`.
-    """
+    """Convert the visual or the tactile images of some pairs to inputs of a model."""
     images = np.stack([views.prepared(*pair, predictor.empty)[index] for pair in pairs])
     height, width = size or images.shape[1:3]
     step = images.shape[1] // height
@@ -94,29 +72,13 @@ def seen(
 
 
 def skill(found: np.ndarray, truth: np.ndarray) -> float:
-    """Skill of predicted images.
-
-    Args:
-        found: Predicted images, `(n, side, side, 3)`.
-        truth: True images, of the same shape.
-
-    Returns:
-        `1 - e / e0`, where `e` is the mean squared error of the predictions, and `e0` is the mean squared error of a
-        prediction of each image by the mean of the other true images.
-    """
+    """Skill of predicted images."""
     others = (truth.sum(0) - truth) / (len(truth) - 1)
     return 1 - float(((found - truth) ** 2).mean() / ((others - truth) ** 2).mean())
 
 
 def main(args: Args) -> None:
-    """Record trajectories of the digital twin, and print a table with the skill of every model.
-
-    The skill is a score of the predicted images. It is 1 if each predicted image equals the true last image. It is 0 if
-    the prediction for each trajectory is the mean of the last images of all other trajectories.
-
-    In the rows with `kept`, the images contain the background of the twin, such as its vignetting. In the rows with
-    `divided out`, this background is replaced by the background of the model's training images (`hardware.relit`).
-    """
+    """Record trajectories of the digital twin, and print a table with the skill of every model."""
     empty, held, rest = collect(args)
     pinhole, (height, width) = sts.Sensor().camera, empty[0].shape[:2]
     lens = hardware.Lens.ideal(width, height, distance=float(pinhole.distance), field_of_view=math.radians(160))

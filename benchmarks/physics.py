@@ -6,22 +6,14 @@
     python -m benchmarks.physics --scaling         # about 10 minutes. Writes benchmarks/results/physics/
     python -m benchmarks.physics --compile         # about 8 minutes
 
-All commands print their results. Only `--scaling` writes files.
-
-- Without an option, the command measures steps per second of MJX and of C MuJoCo's batch function (`mujoco.rollout`)
-  from the same initial poses. MJX uses two threads, and `mujoco.rollout` uses all cores. The command first drops an
-  object with one hull of 32 vertices, then one object of each of the eight classes, with hulls of up to 64 vertices.
-- `--engines N` measures falls per second of both engines of `simulate` (MJX and C MuJoCo), for N falls of each of 16
-  objects. MJX simulates `--chunk` falls at once, and needs a larger `--chunk` on a GPU than on a CPU.
-- `--pipeline N` drops a bottle N times, renders a visual and a tactile image of every frame (64x64, uint8), and fetches
-  the images from the device. The command prints seconds and frames per second of the physics, of the rendering, and of
-  physics and rendering together. A frame is the state of one drop at one time. The engine of the physics is C MuJoCo on
-  a machine without a GPU, and MJX on a GPU.
-- `--scaling` measures steps per second of 1 to 4,096 worlds at once (up to 65,536 on a GPU).
-- `--compile` measures the seconds of compilation before the first step, for each scenario (`freefall`, `perturbed` and
-  `inclined`), and counts the compilations for a hundred objects. For each scenario, the command starts two new
-  processes. The first process starts with an empty compilation cache. The second process starts with the compilation
-  cache that the first process left.
+- Without an option: steps per second of MJX (two threads) and of `mujoco.rollout` (all cores) from the same poses, for
+  one hull of 32 vertices, and for one object of each of the eight classes.
+- `--engines N`: falls per second of both engines of `simulate`, for N falls of each of 16 objects. MJX simulates
+  `--chunk` falls at once, and needs a larger `--chunk` on a GPU.
+- `--pipeline N`: drops a bottle N times, renders both streams of every frame (64x64, uint8), and fetches them.
+- `--scaling`: steps per second of 1 to 4,096 worlds at once (up to 65,536 on a GPU).
+- `--compile`: seconds before the first step with an empty and with a filled compilation cache, and the number of
+  compilations for a hundred objects.
 
 `--engines` and `--pipeline` include all costs except compilation.
 """
@@ -44,9 +36,8 @@ import mujoco.rollout
 import numpy as np
 import tyro
 
-from benchmarks.instruments import fresh
 from benchmarks.instruments.starts import bodies, rigid_of
-from benchmarks.instruments.timing import in_turn
+from benchmarks.instruments.timing import fresh, in_turn
 from experiments.shared import drawing
 from sts_jax import dataset, objects, physics, storage
 from sts_jax.dataset.rendering import RENDER_BATCH
@@ -74,11 +65,7 @@ TACCEL = 915  # environment steps/s of the simulator Taccel, published for 4,096
 
 @dataclasses.dataclass(frozen=True)
 class Args:
-    """Options of the command line.
-
-    Raises:
-        ValueError: More than one of `engines`, `pipeline`, `scaling` and `compile` is given.
-    """
+    """Options of the command line."""
 
     num: int = 8  # drops of each of the eight objects in the comparison with C MuJoCo
     engines: int | None = None  # measure both engines of `simulate`, with this many falls of each object
@@ -120,16 +107,7 @@ def rod() -> objects.Body:
 
 
 def in_c(items: list[objects.Body], traj: physics.Trajectory, constants: physics.Contact) -> tuple[list, np.ndarray]:
-    """Make the model and the initial state with which C MuJoCo can repeat each of the given trajectories.
-
-    Args:
-        items: The objects.
-        traj: Trajectories. Their initial poses and hidden properties, such as friction, are used.
-        constants: Constants of the contact.
-
-    Returns:
-        A `mujoco.MjModel` for each trajectory, and the initial states for `mujoco.rollout`, `(n, size)`.
-    """
+    """Make the model and the initial state with which C MuJoCo can repeat each of the given trajectories."""
     gel, models, states = Sensor().gel.size, [], []
     pad = (float(gel[0]), float(gel[1]))
     compiled = [scene.compile_scene(np.asarray(body.hulls), pad, constants) for body in items]
@@ -148,11 +126,7 @@ def in_c(items: list[objects.Body], traj: physics.Trajectory, constants: physics
 
 
 def speed(num: int) -> None:
-    """Print steps per second of MJX and of C MuJoCo, first for a hull of 32 vertices, then for eight objects.
-
-    Args:
-        num: Number of drops of each of the eight objects. The hull is dropped `8 * num` times.
-    """
+    """Print steps per second of MJX and of C MuJoCo, first for a hull of 32 vertices, then for eight objects."""
     compare_speed("one hull of 32 vertices", [rod()], 8 * num)
     compare_speed("eight objects, up to 64 vertices", bodies(objects.CATEGORIES, 8), num)
 
@@ -180,14 +154,7 @@ def compare_speed(name: str, items: list[objects.Body], num: int) -> None:
 
 
 def engines(num: int, chunk: int) -> None:
-    """Measure the number of falls that each engine of `simulate` computes in a second, and print the two numbers.
-
-    A fall is the trajectory of one object. The falls of 16 different objects are simulated.
-
-    Args:
-        num: Number of falls of each object.
-        chunk: Largest number of falls that MJX simulates at once.
-    """
+    """Measure the number of falls that each engine of `simulate` computes in a second, and print the two numbers."""
     items, sensor, scenario = bodies(objects.CATEGORIES, 16), Sensor(), physics.Freefall()
     calls = [
         functools.partial(physics.simulate, jax.random.key(0), items, sensor, scenario, num, chunk=chunk, engine=engine)
@@ -210,16 +177,7 @@ def grouped(models: list, states: np.ndarray) -> list[tuple[list, np.ndarray]]:
 
 
 def worlds(count: int, frames: int) -> tuple[Worlds, mjx.Model, mjx.Data]:
-    """Make the arguments that `simulate` passes to MJX. The scene is a rod that drops from a height of 2 mm.
-
-    Args:
-        count: Number of worlds, which are trajectories that MJX simulates in parallel. The first 256 worlds have
-            different starts. Further worlds repeat these starts.
-        frames: Frames of each trajectory.
-
-    Returns:
-        The worlds, and the MJX model and data of the scene.
-    """
+    """Make the arguments that `simulate` passes to MJX. The scene is a rod that drops from a height of 2 mm."""
     scenario, body, gel = physics.Freefall(height=0.002, frames=frames), rod(), Sensor().gel.size
     pad, some = (float(gel[0]), float(gel[1])), min(count, 256)
     index = np.zeros(some, np.int32)
@@ -235,15 +193,7 @@ def worlds(count: int, frames: int) -> tuple[Worlds, mjx.Model, mjx.Data]:
 
 
 def scaling(frames: int = 8, chunk: int = 32) -> None:
-    """Measure steps per second against the number of worlds, and write a table and a plot to RESULTS.
-
-    Each number of worlds is measured three times: with MJX and one call for all worlds, with MJX and several calls in
-    parallel threads, and with C MuJoCo.
-
-    Args:
-        frames: Frames of each trajectory.
-        chunk: Number of worlds in each of the parallel MJX calls.
-    """
+    """Measure steps per second against the number of worlds, and write a table and a plot to RESULTS."""
     gpu = jax.default_backend() != "cpu"
     counts = [4**k for k in range(9 if gpu else 7)]
     scenario = physics.Freefall(height=0.002, frames=frames)
@@ -279,13 +229,7 @@ def scaling(frames: int = 8, chunk: int = 32) -> None:
 
 
 def write_scaling(rows: Sequence[Speeds], device: str, chunk: int) -> None:
-    """Write steps per second against the number of worlds to `scaling.md` (table) and `scaling.png` (plot) in RESULTS.
-
-    Args:
-        rows: Steps per second for each number of worlds.
-        device: Name of the device, for the title.
-        chunk: Number of worlds in each MJX call of the measurement `Speeds.in_chunks`, for the legend.
-    """
+    """Write steps per second against the number of worlds to `scaling.md` and `scaling.png`."""
     from matplotlib.figure import Figure
 
     names = ("MJX, all at once", f"MJX, {chunk} at a time, {WORKERS} threads", f"C MuJoCo, {os.cpu_count()} threads")
@@ -343,16 +287,7 @@ def pipeline(count: int) -> None:
 
 
 def first_call(name: str, count: int) -> dict[str, Any]:
-    """Measure the compilation time of `simulate` and count its compilations. Call this function in a new process.
-
-    Args:
-        name: Name of the scenario, in SCENARIOS.
-        count: Number of objects that are made. Objects that cannot be simulated in the scenario are not used.
-
-    Returns:
-        A dict. `seconds`: duration of the first call minus duration of the second call (s). `objects`: number of
-        used objects. `programs`: number of compilations of the four main functions of `simulate` for these objects.
-    """
+    """Measure the compilation time of `simulate` and count its compilations. Call this function in a new process."""
     scenario, sensor, items = SCENARIOS[name], Sensor(), bodies(objects.CATEGORIES, count)
     items = [body for body in items if physics.refusal(body, scenario) is None]
     begin = time.perf_counter()
@@ -378,7 +313,7 @@ def compilation(count: int = 100) -> None:
     for name in SCENARIOS:
         with tempfile.TemporaryDirectory() as folder:
             for kind in ("empty cache", "kept cache"):
-                found = fresh.call("benchmarks.physics.first_call", name, count, cache=Path(folder))
+                found = fresh("benchmarks.physics.first_call", name, count, cache=Path(folder))
                 programs = ", ".join(f"{function} {number}" for function, number in found["programs"].items())
                 print(f"{name:9s} {kind:11s} {found['seconds']:5.1f} s before the first step")
                 print(f"{'':9s} programs for {found['objects']} objects: {programs}", flush=True)

@@ -2,26 +2,17 @@
 
     python -m benchmarks.presses    # about a minute. Writes benchmarks/results/presses/
 
-The package `taxim` 1.4.1 (MIT) contains 48 images (480x640, 0.0295 mm per pixel) of a ball of radius 2 mm that is
-pressed into a GelSight. The package also contains the image without contact (the background), and the centre and radius
-of each contact. Within the contact, the skin has the normals of a sphere. `tactile.phong` is fitted to 36 of the
+The package `taxim` 1.4.1 (MIT) contains 48 images (480x640, 0.0295 mm per pixel) of a ball of radius 2 mm, the centre
+and radius of each contact, and the image without contact (the background). `tactile.phong` is fitted to 36 of the
 presses, and every fourth press is held out. An image is modelled by
 
     image = background (1 + phong(pressed) - phong(flat))
 
-where `pressed` and `flat` are the normals and points of the pressed and of the flat skin. The image of the flat skin is
-thus the background, and the change is proportional to the brightness of the background. All images contain the pixel
-values of the camera divided by 255. Non-negative least squares selects lights from candidates in rings around the
-image. Gradient descent then fits the positions and colours of the lights, the fall-off, the specular reflectance and
-the shininess. The fitted lights explain the images, and need not be at the places of the sensor's LEDs. A few fitted
-lights lie under the part of the gel that the image shows.
-
-The command prints the peak signal-to-noise ratio of the background alone, of a fit with far lights, and of a fit with
-near lights. Each ratio is computed over the pixels of all held-out presses within 0.92 times the radius of the contact.
-For the fits, the command also prints the ratio over the pixels that were fitted. `presses.png` has a column for each
-held-out press: the real image, the rendered image, and `0.5 + 4 (real - rendered)`. Outside of the contact the shape of
-the skin is unknown, and the rendered image is the background. Candidates, number of steps and learning rate were chosen
-on the 36 presses alone.
+where `pressed` (a sphere within the contact) and `flat` are the normals and points of the skin. Non-negative least
+squares selects lights from candidates in rings around the image. Gradient descent then fits the lights, the fall-off,
+the specular reflectance and the shininess. The fitted lights need not be at the places of the sensor's LEDs. Ratios are
+over the pixels of the held-out presses within 0.92 times the radius of the contact. Candidates, number of steps and
+learning rate were chosen on the 36 presses alone.
 """
 
 import dataclasses
@@ -54,10 +45,7 @@ OUT = Path(__file__).parent / "results" / "presses"
 
 @dataclasses.dataclass(frozen=True)
 class Presses:
-    """Images of a ball that is pressed into the sensor, the circle of contact in each, and the image without contact.
-
-    Colours are in [0, 1].
-    """
+    """Images of presses in [0, 1], the circle of contact in each, and the image without contact."""
 
     background: Float[np.ndarray, "h w 3"]
     images: Float[np.ndarray, "n h w 3"]
@@ -84,11 +72,7 @@ class Descent(NamedTuple):
 
 
 def read() -> Presses:
-    """Read the images and contacts from the installed package `taxim`, without importing it.
-
-    Raises:
-        FileNotFoundError: The package is not installed.
-    """
+    """Read the images and contacts from the installed package `taxim`, without importing it."""
     spec = importlib.util.find_spec("taxim")
     path = Path(spec.origin or "").parent / "calib" / "gelsight" / "dataPack.npz" if spec else None
     if path is None or not path.is_file():
@@ -109,19 +93,7 @@ def held_out(number: int) -> np.ndarray:
 def skin_under_ball(
     centre: Float[np.ndarray, "2"], radius: float, row: np.ndarray, column: np.ndarray, shape: tuple[int, int]
 ) -> tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"]]:
-    """Compute normals and points of the skin inside its contact with the ball, where the skin is a part of a sphere.
-
-    Args:
-        centre: Column and row of the contact's centre (pixels).
-        radius: Radius of the contact (pixels).
-        row: Rows of pixels within the contact, `(p,)`.
-        column: Columns of these pixels, `(p,)`.
-        shape: Height and width of the image (pixels).
-
-    Returns:
-        Unit normals towards the camera, and points (m). The origin is in the middle of the image. The skin outside the
-        contact is flat and lies in the plane z = 0, which contains the contact's rim.
-    """
+    """Compute normals and points of the skin inside its contact with the ball, where the skin is a part of a sphere."""
     x, y = PITCH * (column - centre[0]), PITCH * (row - centre[1])
     under = np.sqrt(RADIUS**2 - x**2 - y**2)
     depth = under - np.sqrt(max(RADIUS**2 - (PITCH * radius) ** 2, 0))
@@ -131,14 +103,7 @@ def skin_under_ball(
 
 
 def pixels(presses: Presses, which: np.ndarray, *, every: int = 1, within: float = TRUSTED) -> Pixels:
-    """Collect pixels of the contact circles in several images of a ball that is pressed into the sensor.
-
-    Args:
-        presses: The images, and the contact circle in each.
-        which: Indices of the images.
-        every: Step from one used row to the next, and from one used column to the next.
-        within: Share of the circle's radius within which pixels are used.
-    """
+    """Collect pixels of the contact circles in several images of a ball that is pressed into the sensor."""
     shape, found = presses.background.shape[:2], []
     rows, columns = np.meshgrid(np.arange(0, shape[0], every), np.arange(0, shape[1], every), indexing="ij")
     for index in which:
@@ -151,18 +116,7 @@ def pixels(presses: Presses, which: np.ndarray, *, every: int = 1, within: float
 
 
 def shader(unknowns: dict[str, Array], *, near: bool) -> tuple[tactile.Phong, tactile.Lights | tactile.Leds]:
-    """Convert the unbounded unknowns of the optimisation to reflectance constants and lights within allowed ranges.
-
-    Args:
-        unknowns: The array `place`, `(m, 3)`, contains x and y of each light in mm, and the softplus inverse of the
-            light's depth below the gel's face in mm. The arrays `color`, `(m, 3)`, `falloff`, `specular` and
-            `shininess` contain the softplus inverses of these quantities.
-        near: True returns near lights (LEDs) at the positions (x, y, -depth). False returns far lights in the
-            directions (x, y, -depth), and ignores `falloff`.
-
-    Returns:
-        The constants of the reflectance, and the lights.
-    """
+    """Convert the unbounded unknowns of the optimisation to reflectance constants and lights within allowed ranges."""
     positive = {k: jax.nn.softplus(v) for k, v in unknowns.items()}
     place = jnp.concatenate([unknowns["place"][:, :2], -positive["place"][:, 2:]], axis=1)
     constants = tactile.Phong(specular=positive["specular"], shininess=positive["shininess"])
@@ -175,18 +129,7 @@ def shader(unknowns: dict[str, Array], *, near: bool) -> tuple[tactile.Phong, ta
 
 
 def changes(constants: tactile.Phong, lights: tactile.Lights | tactile.Leds, given: Pixels) -> Float[Array, "m p"]:
-    """Image of the pressed skin minus image of the flat skin, for each light alone. All lights are white.
-
-    The lights are vmapped, because the gradient of the shader's own loop over lights takes minutes to compile.
-
-    Args:
-        constants: Constants of the reflectance.
-        lights: The lights, whose colours are replaced by white.
-        given: The pixels, with points and normals of the pressed skin.
-
-    Returns:
-        The change of the image, `(lights, pixels)`.
-    """
+    """Image of the pressed skin minus image of the flat skin, for each light alone. All lights are white."""
     flat = jnp.broadcast_to(jnp.array([[0.0, 0, -1]]), given.normals.shape)
     normals = jnp.stack([given.normals, flat])
     points = jnp.stack([given.points, given.points * jnp.array([[1.0, 1, 0]])])
@@ -206,11 +149,7 @@ def changes(constants: tactile.Phong, lights: tactile.Lights | tactile.Leds, giv
 
 @jax.jit
 def draw(constants: tactile.Phong, lights: tactile.Lights | tactile.Leds, given: Pixels) -> Float[Array, "p 3"]:
-    """Render colours of the pressed skin, `background (1 + phong(pressed) - phong(flat))`.
-
-    `background` is the image without contact. `phong` is the image of the pressed or the flat skin in Phong's
-    reflectance model with the given constants and lights.
-    """
+    """Render colours of the pressed skin, `background (1 + phong(pressed) - phong(flat))`."""
     return given.background * (1 + changes(constants, lights, given).T @ lights.colors)
 
 
@@ -225,13 +164,7 @@ def _inverse(value: float | np.ndarray) -> Array:
 
 
 def start(given: Pixels, *, near: bool) -> dict[str, Array]:
-    """Compute the lights and the reflectance from which the optimisation starts.
-
-    The result has the format of the argument `unknowns` of `shader`.
-
-    Non-negative least squares selects the lights from candidates in rings around the image. The fall-off, the specular
-    reflectance and the shininess start from constants.
-    """
+    """Compute the lights and the reflectance from which the optimisation starts."""
     rings = [(r, t) for r in ((14, 20, 35) if near else (20,)) for t in (0.2, 0.5, 1.0, 2.0)]
     angles = 2 * np.pi * np.arange(12) / 12
     rows = [[r * np.cos(a + k), r * np.sin(a + k), _inverse(r * t)] for k, (r, t) in enumerate(rings) for a in angles]
@@ -248,11 +181,7 @@ def start(given: Pixels, *, near: bool) -> dict[str, Array]:
 
 @functools.partial(jax.jit, static_argnames=("near", "steps"))
 def refine(unknowns: dict[str, Array], given: Pixels, *, near: bool, steps: int) -> dict[str, Array]:
-    """Fit the unknowns of `shader` to the colours of pixels.
-
-    `draw` computes the colours of the pixels from the unknowns. Adam with a cosine schedule minimises the mean squared
-    difference of these colours from the real colours.
-    """
+    """Fit the unknowns of `shader` to the colours of pixels."""
     optimiser = optax.adam(optax.cosine_decay_schedule(RATE, steps))
 
     def loss(unknowns: dict[str, Array]) -> Array:
@@ -266,32 +195,12 @@ def refine(unknowns: dict[str, Array], given: Pixels, *, near: bool, steps: int)
 
 
 def fit(given: Pixels, *, near: bool, steps: int = STEPS) -> tuple[tactile.Phong, tactile.Lights | tactile.Leds]:
-    """Fit the constants of the reflectance and the lights to the colours of pixels in real tactile images.
-
-    Args:
-        given: The pixels.
-        near: True fits near lights (LEDs), and False fits far lights.
-        steps: Number of steps of Adam.
-
-    Returns:
-        The constants of the reflectance, and the lights.
-    """
+    """Fit the constants of the reflectance and the lights to the colours of pixels in real tactile images."""
     return shader(refine(start(given, near=near), given, near=near, steps=steps), near=near)
 
 
 def panel(presses: Presses, index: int, constants: tactile.Phong, leds: tactile.Leds, *, half: int = 90) -> np.ndarray:
-    """Draw the real image, the rendered image and their difference around a contact, one below the other.
-
-    Args:
-        presses: The images and contacts.
-        index: Number of the press.
-        constants: Fitted constants of the reflectance.
-        leds: Fitted lights.
-        half: Half the side of the drawn square around the contact (pixels).
-
-    Returns:
-        An image in [0, 1], `(6 * half, 2 * half, 3)`. Outside of the contact, the rendered image is the background.
-    """
+    """Draw the real image, the rendered image and their difference around a contact, one below the other."""
     given = pixels(presses, np.array([index]), within=1.0)
     column, row = (int(v) for v in presses.centres[index])
     shape = presses.background.shape[:2]

@@ -3,9 +3,8 @@
     python -m benchmarks.recognise runs/freefall --out recognise.png           # about a minute
     python -m benchmarks.recognise runs/freefall --given visual pose --first 20
 
-The command predicts ten consecutive held-out trajectories of a run. The upper rows of the picture show one predicted
-sample of the last visual image of each trajectory (A to J). The lower rows show the ten true last images in another
-order (1 to 10). The command writes the picture to `--out` and prints the answers. With random answers, a person has one
+The upper rows show one sample of the last visual image of each of ten held-out trajectories (A to J), the lower rows
+the true last images in another order (1 to 10). The command prints the answers. With random answers, a person has one
 correct pair on average.
 """
 
@@ -37,11 +36,7 @@ class Args:
 
 
 def main(args: Args) -> str:
-    """Draw predicted images (A to J) and true images (1 to 10) in one picture, and return the correct pairs as text.
-
-    Raises:
-        ValueError: The option `--first` is negative, or it is too large for the number of held-out trajectories.
-    """
+    """Draw predicted images (A to J) and true images (1 to 10) in one picture, and return the correct pairs as text."""
     if args.first < 0:
         raise ValueError(f"--first must be at least 0, got {args.first}")
     data = dataset.load(args.workdir / "dataset")

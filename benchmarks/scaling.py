@@ -3,12 +3,9 @@
     python -m benchmarks.scaling runs/freefall --out scaling.png                     # about 20 minutes
     python -m benchmarks.scaling runs/freefall --shares 1 --steps 1900 --seeds 1 2   # two more seeds show the spread
 
-The command uses the dataset of a run of an experiment (with `--preset default`), and trains models in the folder
-`scaling` of the run. Some models are trained on a share of the training objects (`--shares`), with the largest number
-of steps in `--steps`. The other models are trained on all training objects, with each number of steps in `--steps`.
-Models that exist already in the folder are not trained again. The command prints the errors of the predictions for the
-held-out objects, and writes a plot of the visual skill with 95 % intervals to `--out`. The visual skill is a score of
-the predicted visual images. Perfect images have the skill 1, and the mean training image has the skill 0.
+The command trains models on the dataset of a run (with `--preset default`), in the folder `scaling` of the run: some on
+a share of the training objects (`--shares`) with the largest number of `--steps`, the others on all training objects
+with each number of `--steps`. It prints the errors for the held-out objects, and plots the visual skill to `--out`.
 """
 
 import dataclasses
@@ -66,19 +63,7 @@ def some(part: Part, objects: np.ndarray) -> Part:
 def train(
     config: Config, data: dataset.Dataset, folder: Path, share: float, steps: int, seed: int
 ) -> tuple[int, float]:
-    """Train a model, unless `folder` already contains a trained model.
-
-    Args:
-        config: Configuration of the run.
-        data: Dataset of the run.
-        folder: Folder of the model.
-        share: Share of the training objects that are used.
-        steps: Number of gradient steps.
-        seed: Seed of the weights and of the order of the batches.
-
-    Returns:
-        The number of training trajectories, and the time of all steps in minutes, without compilation.
-    """
+    """Train a model, unless `folder` already contains a trained model."""
     pairs, views = data.pairs(data.members("train")), data.views("train")
     falls = data.ends(data.members("train", rendered=False))
     objects = np.unique(falls.object)
@@ -100,13 +85,7 @@ def train(
 
 
 def best_possible(workdir: Path) -> float | None:
-    """Read the skill of the best possible prediction of visual images from `metrics.json` in a work directory.
-
-    The skill is a score of predicted images (see `evaluation.metrics.skill`).
-
-    Returns:
-        The skill, or None if the file or the value is missing.
-    """
+    """Read the skill of the best possible prediction of visual images from `metrics.json` in a work directory."""
     path = workdir / "metrics.json"
     if not path.exists():
         return None

@@ -2,29 +2,19 @@
 
     python -m benchmarks.sensor             # about 12 minutes on two CPU cores, most of it compilation
     python -m benchmarks.sensor --taxim     # about a minute: tactile images from height maps, compared with taxim
-    python -m benchmarks.sensor --cost      # about 10 minutes: cost per pixel and per face, memory
+    python -m benchmarks.sensor --cost      # about 10 minutes: cost per pixel and per face, memory, a plot
     python -m benchmarks.sensor --compile   # about 2 minutes: number of compilations for a hundred objects
 
-All commands print their results. Only `--cost` writes a file, the plot benchmarks/results/sensor/cost.png.
-
-Without an option, the command calls `sense` for objects at rest on the pad. `sense` computes the equilibrium of the
-gel, the visual image, the tactile image, the depth and the segmentation. For comparison, embree traces only the depth
-of the same faces and poses, in three ways:
+`sense` renders whole frames of objects at rest. embree traces only the depth of the same scenes, in three ways:
 
 - `traced`: one call of embreex with all rays of an image, and a scene that was built beforehand
 - `built`: a call that also builds the scene, because a moving object needs a new scene for each pose
 - `trimesh`: the Python interface `mesh.ray` of trimesh
 
-All calls are timed in one thread, and also in as many threads as there are cores. One call of `sense` uses little more
-than one core, so `dataset.collect` runs several calls at once, in threads. On a GPU, one call of `sense` renders a
-batch instead. Calls of `sense` and of embree are timed alternately, and the figures are medians.
-
-The first table has the frames per second. For each of the three ways, it also has the ratio of embree's seconds to the
-seconds of `sense`, with the same number of threads.
-
-The second table has the share of each stage in the time of `sense`. At 640x480 it also has the speed relative to the
-code of the paper (Rezaei-Shoshtari et al. 2021). The renderer and the shader of the paper's code, without physics, took
-0.40 s per frame in a single measurement on a CPU.
+One call of `sense` uses little more than one core, so `dataset.collect` runs several calls at once, in threads. On a
+GPU, one call renders a batch instead. Calls of `sense` and of embree alternate, and the figures are medians. The second
+table has the share of each stage in the time of `sense`, and at 640x480 the speed relative to the code of the paper
+(Rezaei-Shoshtari et al. 2021), whose renderer and shader took 0.40 s per frame in a single measurement on a CPU.
 """
 
 import concurrent.futures
@@ -48,9 +38,8 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 import sts_jax as sts
-from benchmarks.instruments import fresh
-from benchmarks.instruments.meshes import public_meshes
-from benchmarks.instruments.timing import in_turn
+from benchmarks.instruments.timing import fresh, in_turn
+from benchmarks.instruments.truth import public_meshes
 from experiments.shared.drawing import write_figure
 from sts_jax import geometry, objects, optics, tactile
 from sts_jax.rendering import drawing, equilibrium
@@ -70,11 +59,7 @@ Works = list[Callable[[], object]]  # one call for each pose
 
 @dataclasses.dataclass(frozen=True)
 class Args:
-    """Options of the command line.
-
-    Raises:
-        ValueError: More than one of `taxim`, `cost` and `compile` is True.
-    """
+    """Options of the command line."""
 
     taxim: bool = False  # measure tactile images from height maps, compared with taxim
     cost: bool = False  # measure the cost per pixel and per face, and the memory
@@ -96,10 +81,7 @@ class Case(NamedTuple):
 
 
 class Durations(NamedTuple):
-    """Median seconds per frame of `sense` and of the ray tracer Embree.
-
-    The time of `sense` is measured for the whole frame and for some of its outputs, such as the depth.
-    """
+    """Median seconds per frame of `sense` and of the ray tracer Embree."""
 
     frame: float  # a whole frame
     gel: float  # balance of the gel alone
@@ -135,11 +117,7 @@ def count(body: objects.Body) -> int:
 
 
 def resting(body: objects.Body, number: int = POSES) -> Inputs:
-    """Make poses of a body that stands upright on the pad, at `number` equally spaced angles about the vertical.
-
-    Returns:
-        Poses `(number, 7)`, and wrenches `(number, 6)` with which the pad carries the weight of the body.
-    """
+    """Make poses of a body that stands upright on the pad, at `number` equally spaced angles about the vertical."""
     mass, com, _ = objects.rigid(body, 0.5, 1.0)
     angles = jnp.linspace(0, 2 * jnp.pi, number, endpoint=False)
     low = jnp.min(body.vertices[body.faces.ravel(), 2])
@@ -154,17 +132,7 @@ def resting(body: objects.Body, number: int = POSES) -> Inputs:
 
 
 def embree(body: objects.Body, poses: jax.Array, shape: tuple[int, int]) -> dict[str, Works]:
-    """Make functions that trace the depth of an object with embree.
-
-    Args:
-        body: The object.
-        poses: Poses of the object, `(n, 7)`.
-        shape: Height and width of the images (pixels).
-
-    Returns:
-        A dictionary with the keys `traced`, `built` and `trimesh`, which the docstring of the module defines. Each
-        value is a list with a function for each pose.
-    """
+    """Make functions that trace the depth of an object with embree."""
     camera = sts.Sensor().camera
     faces = np.asarray(body.faces)
     faces = faces[np.any(faces != faces[:, :1], axis=1)]
@@ -210,15 +178,7 @@ def frames(
     fields: tuple[str, ...] = (),
     batched: bool = False,
 ) -> object:
-    """Render frames of an object in one compiled call.
-
-    Args:
-        body: The object.
-        inputs: Poses `(n, 7)` and wrenches `(n, 6)`.
-        shape: Height and width of the images (pixels).
-        fields: Fields of `Frame` to return. XLA omits the work for all other fields. Default: the whole frame.
-        batched: Render all frames with `jax.vmap`. Otherwise, one after the other with `jax.lax.map`.
-    """
+    """Render frames of an object in one compiled call."""
 
     def draw(inputs: Inputs) -> object:
         whole = sts.sense(sts.Sensor(), body, *inputs, resolution=shape)
@@ -228,10 +188,7 @@ def frames(
 
 
 def speed() -> None:
-    """Print frames per second of `sense` and of the ray tracer Embree, for several objects, meshes and image sizes.
-
-    A second table has the share of the time that each stage of `sense` takes.
-    """
+    """Print frames per second of `sense` and of the ray tracer Embree, for several objects, meshes and image sizes."""
     every = f"{os.cpu_count()} threads" if jax.default_backend() == "cpu" else "batched"
     print(f"frames /s, and embree's seconds over ours: traced, built, trimesh; {jax.devices()[0].device_kind}")
     print(f"{'object':9} {'faces':>6} {'image':>9} | {'one thread':>37} | {every:>37}")
@@ -257,11 +214,7 @@ def cases() -> Iterator[Case]:
 
 
 def measure(case: Case) -> Durations:
-    """Measure the seconds per frame of `sense` and of the ray tracer Embree.
-
-    Both are measured in one thread, and also in as many threads as there are cores. On a GPU, `sense` is not measured
-    in several threads. Instead, a single call of `sense` that renders a batch is measured.
-    """
+    """Measure the seconds per frame of `sense` and of the ray tracer Embree."""
     cores, on_cpu = os.cpu_count() or 1, jax.default_backend() == "cpu"
     pool = concurrent.futures.ThreadPoolExecutor(cores)
 
@@ -287,11 +240,7 @@ def measure(case: Case) -> Durations:
 
 
 def rates(case: Case, found: Durations) -> str:
-    """Format a table row: frames per second of `sense` and of embree, and the ratios of their times.
-
-    The row has these values first for one frame at a time, and then for several frames at once. A ratio is the time of
-    embree divided by the time of `sense`. There is one ratio for each of the three ways to call embree, see `embree`.
-    """
+    """Format a table row: frames per second of `sense` and of embree, and the ratios of their times."""
     row = [f"{case.name} |"]
     for mine, theirs in ((found.frame, found.embree), (found.at_once, found.embree_at_once)):
         row += [f"{1 / mine:8.1f}  {1 / theirs[0]:6.0f}", *(f"{t / mine:6.2f}" for t in theirs), "|"]
@@ -299,12 +248,7 @@ def rates(case: Case, found: Durations) -> str:
 
 
 def shares(case: Case, found: Durations) -> str:
-    """Format one case as a table row: the time of `sense` per frame (ms), and each stage's share of this time (%).
-
-    The stages compute the equilibrium of the gel, the depth, the visual image and the tactile image. For images of
-    640x480 pixels, the row also has the speed of `sense` relative to the code of the paper (Rezaei-Shoshtari et al.
-    2021).
-    """
+    """Format one case as a table row: the time of `sense` per frame (ms), and each stage's share of this time (%)."""
     stages = [found.gel, found.depth - found.gel, found.visual - found.depth, found.tactile - found.depth]
     line = " ".join(f"{100 * stage / found.frame:9.0f}" for stage in stages)
     paper = f"   {PAPER / found.at_once:.1f} times the paper's" if case.shape == (480, 640) else ""
@@ -312,44 +256,20 @@ def shares(case: Case, found: Durations) -> str:
 
 
 def ball(shape: tuple[int, int], pitch: float, *, radius: float = 4e-3, depth: float = 1e-3) -> np.ndarray:
-    """Imprint of a ball in the middle of an image.
-
-    Args:
-        shape: Height and width of the image (pixels).
-        pitch: Width of a pixel (m).
-        radius: Radius of the ball (m).
-        depth: Largest depth of the imprint (m).
-
-    Returns:
-        Depth of the imprint (m), an array of the given shape.
-    """
+    """Imprint of a ball in the middle of an image."""
     y, x = ((np.arange(n) - (n - 1) / 2) * pitch for n in shape)
     square = radius**2 - x[None, :] ** 2 - y[:, None] ** 2
     return np.maximum(np.sqrt(np.maximum(square, 0)) - radius + depth, 0).astype(np.float32)
 
 
 def waves(shape: tuple[int, int], pitch: float, *, depth: float = 1e-3) -> np.ndarray:
-    """Imprint of waves over a whole image.
-
-    Args:
-        shape: Height and width of the image (pixels).
-        pitch: Width of a pixel (m).
-        depth: Largest depth of the imprint (m).
-
-    Returns:
-        Depth of the imprint (m), an array of the given shape.
-    """
+    """Imprint of waves over a whole image."""
     y, x = ((np.arange(n) - (n - 1) / 2) * pitch for n in shape)
     return (depth * (0.6 + 0.2 * np.sin(2e3 * x)[None, :] + 0.2 * np.sin(1.4e3 * y)[:, None])).astype(np.float32)
 
 
 def compare_taxim(shape: tuple[int, int] = (480, 640), pitch: float = 0.0295e-3) -> None:
-    """Print the time that `sts_jax.touch` and the simulator Taxim need for a tactile image of an imprint.
-
-    Args:
-        shape: Height and width of the image (pixels).
-        pitch: Width of a pixel (m).
-    """
+    """Print the time that `sts_jax.touch` and the simulator Taxim need for a tactile image of an imprint."""
     from taxim import Taxim  # an optional dependency that only this measurement needs
 
     theirs = Taxim(backend="jax")
@@ -382,19 +302,7 @@ def compare_taxim(shape: tuple[int, int] = (480, 640), pitch: float = 0.0295e-3)
 
 
 def cost_of(faces: int, height: int, width: int) -> dict[str, float]:
-    """Measure the time and the peak memory to render a frame of a bottle.
-
-    This function must be called in a new process, because the peak memory includes all earlier work of the process.
-
-    Args:
-        faces: Approximate number of faces.
-        height: Height of the image (pixels).
-        width: Width of the image (pixels).
-
-    Returns:
-        A dictionary with the number of faces (`faces`), the seconds per frame (`seconds`) and the peak memory of this
-        process (`bytes`).
-    """
+    """Measure the time and the peak memory to render a frame of a bottle."""
     body, shape = finer(objects.make(jax.random.key(0), "bottle"), faces), (height, width)
     poses, wrenches = resting(body, 1 if shape == COST_SIZES[-1] else 4)  # four frames of this size are 0.2 GiB
     (seconds,) = median_seconds(lambda: frames(body, (poses, wrenches), shape=shape))
@@ -403,13 +311,10 @@ def cost_of(faces: int, height: int, width: int) -> dict[str, float]:
 
 
 def cost() -> None:
-    """Measure the time and the peak memory of rendering a frame, for several image sizes and numbers of faces.
-
-    Each measurement runs in a new process. The results are printed, and the times are plotted.
-    """
+    """Measure the time and the peak memory of rendering a frame, for several image sizes and numbers of faces."""
 
     def measured(faces: int, shape: tuple[int, int]) -> dict[str, float]:
-        found = fresh.call("benchmarks.sensor.cost_of", faces, *shape)
+        found = fresh("benchmarks.sensor.cost_of", faces, *shape)
         seconds, image = found["seconds"], f"{shape[1]:5}x{shape[0]:<5}"
         per_pixel = 1e9 * seconds / shape[0] / shape[1]
         memory = f"{found['bytes'] / 2**30:6.2f} GiB held at most"

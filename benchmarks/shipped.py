@@ -3,17 +3,10 @@
     python -m benchmarks.shipped perturbed    # about 15 minutes on two CPU cores, 5 GB of memory
     python -m benchmarks.shipped perturbed --trained runs/perturbed/models/statespace    # another trained model
 
-The outcome of a trajectory is the event that happens to the object, such as falling off. An experiment has few held-out
-objects, so the confidence intervals of the outcome metrics in the experiment's table are wide. This command draws new
-objects from the distribution of the experiment, and simulates and renders four trajectories of each object. The command
-prints metrics of the shipped model, and the relative reduction of the outcome's log loss if the model sees the tactile
-image in addition to the visual image. It also draws 16 samples of each prediction, and prints metrics of the samples,
-such as the sharpness.
-
-The calibration error of few trajectories is above 0 even if the probabilities are exact. The command therefore also
-draws outcomes from the model's own probabilities, and prints the calibration error for these outcomes.
-
-The trajectories are stored in the work directory, and a second run does not simulate them again.
+An experiment has few held-out objects, so its intervals are wide. This command draws new objects, and simulates and
+renders four trajectories of each, which stay in the work directory. The calibration error of few trajectories is above
+0 even if the probabilities are exact, so the command also prints it for outcomes that are drawn from the model's own
+probabilities.
 """
 
 import dataclasses
@@ -64,11 +57,7 @@ class Args:
 
 
 def collection(args: Args) -> dataset.Collection:
-    """Make the settings of a dataset that tests the model `args.model` on objects that no model was trained on.
-
-    The training split contains a fifth of the objects. It does not train a model, but only defines the baselines and
-    the frequencies of the outcomes. The test split contains the other objects. The validation split is empty.
-    """
+    """Make the settings of a dataset that tests the model `args.model` on objects that no model was trained on."""
     return dataclasses.replace(
         EXPERIMENTS[args.model].COLLECTION,
         num_objects=args.objects,
@@ -82,27 +71,13 @@ def collection(args: Args) -> dataset.Collection:
 
 
 def if_calibrated(confidence: np.ndarray, *, draws: int = DRAWS, seed: int = 0) -> float:
-    """Compute the mean calibration error that chance alone causes if the predicted probabilities are correct.
-
-    In each draw, the likeliest outcome of trajectory i is the true one with the probability `confidence[i]`.
-
-    Args:
-        confidence: Probability of the likeliest outcome of each trajectory, `(n,)`.
-        draws: Number of times that all outcomes are drawn.
-        seed: Seed of the draws.
-    """
+    """Compute the mean calibration error that chance alone causes if the predicted probabilities are correct."""
     drawn = np.random.default_rng(seed).random((draws, len(confidence))) < confidence
     return float(np.mean([evaluation.metrics.calibration_error(confidence, right) for right in drawn]))
 
 
 def main(args: Args) -> str:
-    """Test a model on new trajectories, and return a table of the main metrics and a table for sampled predictions.
-
-    Raises:
-        FileNotFoundError: The folder `--trained` contains no model.
-        ValueError: There are fewer than 5 objects, the work directory has trajectories from a run with other options,
-            or the model in `--trained` is not a state-space model of the experiment's scenario.
-    """
+    """Test a model on new trajectories, and return a table of the main metrics and a table for sampled predictions."""
     if args.objects < 5:
         raise ValueError(
             f"--objects must be at least 5, got {args.objects}. A fifth of the objects is for the baselines, and they "

@@ -5,17 +5,11 @@
     python -m benchmarks.soak --keep FOLDER              # keep finished blocks in a folder, and resume from it
     python -m benchmarks.soak --first-block 17           # skip blocks 0 to 16, if another machine runs these blocks
 
-A new object is made for every eight trajectories. Objects of all classes are made in turn, except in the scenario
-`perturbed` (the jerked pad), where all objects are bottles. The command counts the outcomes, such as falling off, and
-the unsettled trajectories. A trajectory is unsettled if the object is neither at rest nor off the pad at the end. The
-command also counts the trajectories that `simulate` discarded and replaced by new ones, because they were not finite or
-because the object sank deeper into the pad than `physics.simulation.SUNK_LIMIT`.
-
-The command compares the wrench at rest with the weight. For the frames without contact, it compares the energy of the
-object with the energy at the start, except in `perturbed`, where gravity changes. All results are printed.
-
-The trajectories are simulated in blocks of 504, or of fewer if fewer are requested. `benchmarks.hidden --soaked FOLDER`
-analyses the blocks that `--keep FOLDER` has kept.
+A new object is made for every eight trajectories. A trajectory is unsettled if the object is neither at rest nor off
+the pad at the end. Trajectories that `simulate` discarded, because they were not finite or sank deeper than
+`physics.simulation.SUNK_LIMIT`, are counted. The wrench at rest is compared with the weight, and the energy without
+contact with that at the start, except in `perturbed`, where gravity changes. `benchmarks.hidden --soaked FOLDER`
+analyses kept blocks.
 """
 
 import dataclasses
@@ -41,11 +35,7 @@ BLOCK = 504  # trajectories simulated by one call, unless fewer are requested
 
 @dataclasses.dataclass(frozen=True)
 class Args:
-    """Options of the command line.
-
-    Raises:
-        ValueError: `first_block` is not the number of a requested block.
-    """
+    """Options of the command line."""
 
     num: int = 10_000  # number of trajectories of each scenario
     # the only scenario to simulate (default: all)
@@ -62,17 +52,7 @@ class Args:
 def excess_energy(
     rigid: tuple[np.ndarray, np.ndarray, np.ndarray], pose: np.ndarray, velocity: np.ndarray, gravity: np.ndarray
 ) -> np.ndarray:
-    """Compute the mechanical energy in each frame, minus the mechanical energy in the first frame.
-
-    Args:
-        rigid: Mass (kg), `(n,)`, centre of mass in the mesh frame (m), `(n, 3)`, and inertia (kg m^2), `(n, 3, 3)`.
-        pose: Poses of `n` trajectories of `f` frames, `(n, f, 7)`.
-        velocity: Velocity of the mesh frame's origin (m/s) and angular velocity (rad/s), `(n, f, 6)`.
-        gravity: Constant acceleration of gravity (m/s^2), `(3,)`.
-
-    Returns:
-        `(n, f)`, in units of the weight times 50 mm.
-    """
+    """Compute the mechanical energy in each frame, minus the mechanical energy in the first frame."""
     mass, com, inertia = (np.asarray(x, np.float64) for x in rigid)
     rotation = np.asarray(geometry.quat_to_matrix(jnp.asarray(pose[..., 3:])), np.float64)
     arm = np.einsum("nfij,nj->nfi", rotation, com)
@@ -84,21 +64,7 @@ def excess_energy(
 
 
 def block(name: str, index: int, size: int) -> dict[str, np.ndarray]:
-    """Simulate a block of trajectories of a scenario.
-
-    Args:
-        name: Name of the scenario, in SCENARIOS.
-        index: Number of the block, from 0.
-        size: Number of trajectories, a multiple of NUM.
-
-    Returns:
-        Arrays by name, with a row for each trajectory. `wrench_error` is the difference between the force of the pad on
-        the resting object and the force that balances the object's weight. It is the length of the difference vector,
-        divided by the weight, and nan for trajectories whose object does not rest on the pad or touches the wall.
-        `excess` is the largest gain of energy since the first frame, over the frames without contact (see
-        `excess_energy`). It is -inf for trajectories whose object fell off or had contact in every frame. It is nan for
-        scenarios in which gravity changes.
-    """
+    """Simulate a block of trajectories of a scenario."""
     scenario = SCENARIOS[name]
     first = index * size // NUM
     items = bodies(("bottle",) if scenario.must_stand else objects.CATEGORIES, size // NUM, first)
@@ -133,12 +99,7 @@ def block(name: str, index: int, size: int) -> dict[str, np.ndarray]:
 
 
 def report(name: str, found: dict[str, np.ndarray]) -> str:
-    """Format the results of one scenario as lines of text.
-
-    Args:
-        name: Name of the scenario.
-        found: Arrays by name, as `block` returns them. Each array has one row for each trajectory of the scenario.
-    """
+    """Format the results of one scenario as lines of text."""
     outcome = found["outcome"]
     shares = {o.name.lower(): np.mean(outcome == o) for o in SCENARIOS[name].outcomes}
     lines = [
@@ -163,10 +124,7 @@ def report(name: str, found: dict[str, np.ndarray]) -> str:
 
 
 def main(args: Args, folder: Path) -> None:
-    """Simulate the trajectories of each requested scenario in blocks, and print the results.
-
-    A block is stored as a file in `folder`. Blocks that are there already are not simulated again.
-    """
+    """Simulate the trajectories of each requested scenario in blocks, and print the results."""
     size = min(BLOCK, -(-args.num // NUM) * NUM)
     for name in [args.only] if args.only else list(SCENARIOS):
         claim(folder, name, size)

@@ -1,12 +1,10 @@
-"""Frame rates of the digital twin (a simulated camera and LED controller) at 640x480 and at 1640x1232.
+"""Frame rates of the digital twin at 640x480 and at 1640x1232.
 
     python -m benchmarks.twin
 
-For each size, the command prints the time to render one pose of an object, the time to make a noisy frame with the
-light on for half of the exposure, and the time to encode this frame as JPEG. The command also prints two frame rates,
-which are measured with the light off. The first is the number of frames that the twin makes per second if it does not
-wait between frames. The second is the rate at which a second process receives frames through OpenCV. All values are
-medians, and all processes run on one CPU core.
+For each size, the command prints the time to render one pose, to make a noisy frame with the light on for half of the
+exposure, and to encode it as JPEG, then the rates at which the twin makes frames and at which a second process receives
+them through OpenCV, with the light off. All values are medians, and all processes run on one CPU core.
 """
 
 import dataclasses
@@ -61,15 +59,7 @@ def timed(call: Callable[[], object], number: int) -> float:
 
 
 def held(size: tuple[int, int], exposure_s: float) -> tuple[twin.Twin, twin.ObjectScene]:
-    """Make a digital twin of the sensor and a scene for it. The object in the scene has the shape of a photo camera.
-
-    The lens of the twin has a field of view of 160 degrees. The pad is empty until the twin receives the command
-    `hold`, which places the object on the pad.
-
-    Args:
-        size: Height and width of the frames (pixels).
-        exposure_s: Exposure time of a frame (s).
-    """
+    """Make a digital twin of the sensor and a scene for it. The object in the scene has the shape of a photo camera."""
     sensor = sts.Sensor()
     scene = twin.ObjectScene(sts.objects.make(jax.random.key(0), "camera"), sensor=sensor, resolution=size)
     warp = twin.lens_warp(Lens.ideal(size[1], size[0]), sensor.camera, size)
@@ -78,14 +68,7 @@ def held(size: tuple[int, int], exposure_s: float) -> tuple[twin.Twin, twin.Obje
 
 
 def served(size: tuple[int, int], number: int) -> float:
-    """Rate at which a second process receives frames of the digital twin over HTTP (frames/s).
-
-    The rate is the median over windows of `WINDOW` frames.
-
-    Args:
-        size: Height and width of the frames (pixels).
-        number: Number of frames.
-    """
+    """Rate at which a second process receives frames of the digital twin over HTTP (frames/s)."""
     device, _ = held(size, 1 / RATE)
     device.scene.prepare("hold", device.blender)
     with device, twin.Served(device) as server:
@@ -99,11 +82,7 @@ def served(size: tuple[int, int], number: int) -> float:
 
 
 def main(args: Args) -> None:
-    """Measure the digital twin on one CPU core, and print one line for each image size in SIZES.
-
-    A line has the times to render a pose, to make a noisy frame and to encode this frame as JPEG. It also has the rate
-    at which the twin makes frames, and the rate at which a second process receives frames.
-    """
+    """Measure the digital twin on one CPU core, and print one line for each image size in SIZES."""
     core = min(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {core})
     for size in SIZES:

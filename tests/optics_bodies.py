@@ -6,8 +6,7 @@ import trimesh
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from benchmarks.instruments.meshes import public_meshes
-from benchmarks.instruments.truth import body_mesh, embree, interior
+from benchmarks.instruments.truth import body_mesh, embree, interior, public_meshes
 from sts_jax.objects.body import FACE_CLASSES, Body
 
 __all__ = ["body_mesh", "embree", "from_trimesh", "interior", "public_meshes", "rays_hidden"]

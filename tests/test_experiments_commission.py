@@ -13,8 +13,7 @@ import pytest
 from PIL import Image
 
 import sts_jax as sts
-from benchmarks.instruments.led_peer import Peer
-from benchmarks.instruments.sensor_peer import DARK, LIT, Lights, SeenController, SeenLights
+from benchmarks.instruments.peers import DARK, LIT, Lights, Peer, SeenController, SeenLights
 from experiments import commission
 from experiments.shared import commissioning
 from sts_jax import hardware

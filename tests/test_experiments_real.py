@@ -19,8 +19,7 @@ from session_writer import ORIGIN, pair
 from test_hardware_collecting import check
 
 import sts_jax as sts
-from benchmarks.instruments.camera_server import SIZE
-from benchmarks.instruments.sensor_peer import DARK, LIT, SensorPeer
+from benchmarks.instruments.peers import DARK, LIT, SIZE, SensorPeer
 from experiments import real
 from experiments.shared.collecting import person
 from experiments.shared.page import CollectPage

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.instruments.camera_server import SIZE, MotionJpeg, number_of
+from benchmarks.instruments.peers import SIZE, MotionJpeg, number_of
 from sts_jax.hardware import (
     CameraConfig,
     CameraError,

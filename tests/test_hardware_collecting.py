@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from player import Player
 
-from benchmarks.instruments.camera_server import SIZE
-from benchmarks.instruments.sensor_peer import DARK, LIT, SensorPeer
+from benchmarks.instruments.peers import DARK, LIT, SIZE, SensorPeer
 from sts_jax import hardware, storage
 from sts_jax.hardware import Action, Stage
 from sts_jax.hardware.proof import Settling

@@ -8,8 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from benchmarks.instruments.camera_server import SIZE
-from benchmarks.instruments.sensor_peer import DARK, LIT, SensorPeer
+from benchmarks.instruments.peers import DARK, LIT, SIZE, SensorPeer
 from sts_jax import hardware
 from sts_jax.hardware.proof import Settling, Switch, difference, settling, switched_share
 

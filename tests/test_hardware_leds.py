@@ -20,7 +20,7 @@ import serial
 from led_simulator import Simulated, until
 from serial.tools import list_ports_common
 
-from benchmarks.instruments.led_peer import Peer
+from benchmarks.instruments.peers import Peer
 from sts_jax import hardware
 from sts_jax.hardware import emulation, protocol
 from sts_jax.hardware.leds import checked_levels

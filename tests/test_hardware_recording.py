@@ -16,7 +16,7 @@ from recording_writer import PERIOD_S, shot, write
 from session_writer import ORIGIN, SIZE
 from test_experiments_real import sensor_file
 
-from benchmarks.instruments.sensor_peer import SensorPeer
+from benchmarks.instruments.peers import SensorPeer
 from sts_jax import hardware
 from sts_jax.storage import DamagedFileError
 

@@ -19,30 +19,13 @@ NUM = 8  # trajectories of each object
 
 
 def claim(folder: Path, name: str, size: int) -> None:
-    """Write a JSON file with the simulation settings of a scenario, such as the number of trajectories per object.
-
-    Raises:
-        ValueError: `folder` already has such a file with other settings. The message names all settings that differ.
-    """
+    """Write a JSON file with the simulation settings of a scenario, such as the number of trajectories per object."""
     settings = {"scenario": repr(SCENARIOS[name]), "num": NUM, "block": size, "sunk_limit": SUNK_LIMIT}
     storage.claim(folder / f"{name}.json", settings)
 
 
 def soaked(folder: Path, name: str) -> Starts:
-    """Load the initial states and outcomes of a scenario's trajectories, which a run with `--keep` stored.
-
-    Args:
-        folder: Folder of a run with `--keep`.
-        name: Name of the scenario, in SCENARIOS.
-
-    Returns:
-        The initial states and outcomes, with one row for each trajectory. All values of the field `rerolled` are -1.
-        This field is for benchmarks that simulate each initial state a second time.
-
-    Raises:
-        FileNotFoundError: The folder has no stored trajectories of the scenario.
-        ValueError: The trajectories were made with other settings. The message names all settings that differ.
-    """
+    """Load the initial states and outcomes of a scenario's trajectories, which a run with `--keep` stored."""
     claimed, paths = folder / f"{name}.json", sorted(folder.glob(f"{name}-????.npz"))
     if not (claimed.exists() and paths):
         raise FileNotFoundError(

@@ -31,16 +31,7 @@ class Interval(NamedTuple):
 
 
 def probabilities(x: np.ndarray, y: np.ndarray, groups: np.ndarray) -> np.ndarray:
-    """Predict the class of each row by boosted trees that were fitted to rows of other groups.
-
-    Args:
-        x: Features, `(n, k)`. Entries may be nan.
-        y: Classes, int `(n,)`, from 0.
-        groups: The group of each row, `(n,)`.
-
-    Returns:
-        Probabilities of the classes, `(n, classes)`, at least FLOOR.
-    """
+    """Predict the class of each row by boosted trees that were fitted to rows of other groups."""
     result = np.zeros((len(y), y.max() + 1))
     # The trees are small, so more threads would only wait for each other on a busy machine.
     with threadpool_limits(1):
@@ -65,29 +56,16 @@ def mean(values: np.ndarray, weight: np.ndarray) -> float:
 
 
 def gain(before: np.ndarray, after: np.ndarray, weight: np.ndarray) -> float:
-    """Relative decrease of the weighted mean loss, `1 - mean(after, weight) / mean(before, weight)`.
-
-    The losses `before` and `after` and their weights have the shape `(n,)`.
-    """
+    """Relative decrease of the weighted mean loss, `1 - mean(after, weight) / mean(before, weight)`."""
     return 1 - mean(after, weight) / mean(before, weight)
 
 
 def kept(before: np.ndarray, after: np.ndarray, other: np.ndarray, weight: np.ndarray) -> float:
-    """Ratio of the gains of two classifiers, `gain(before, other, weight) / gain(before, after, weight)`.
-
-    A gain is the relative decrease of the weighted mean loss. `after` and `other` are the losses of the two
-    classifiers, and `before` is the loss of a baseline. All losses and weights have the shape `(n,)`.
-    """
+    """Ratio of the gains of two classifiers, `gain(before, other, weight) / gain(before, after, weight)`."""
     return gain(before, other, weight) / gain(before, after, weight)
 
 
 def interval(statistic: Callable[..., float], *columns: np.ndarray, groups: np.ndarray) -> Interval:
-    """Compute a statistic and its 95 % interval, from a bootstrap that resamples groups of rows.
-
-    Args:
-        statistic: A function of the columns and of the weights of the rows, `(n,)`, such as `mean`.
-        columns: Arguments of the statistic, `(n,)` each.
-        groups: The group of each row, `(n,)`.
-    """
+    """Compute a statistic and its 95 % interval, from a bootstrap that resamples groups of rows."""
     draws = metrics.bootstrap(groups, lambda weight: np.asarray(statistic(*columns, weight)))
     return Interval(statistic(*columns, np.ones(len(groups))), *metrics.interval(draws))

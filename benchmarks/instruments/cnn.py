@@ -18,11 +18,7 @@ Weights = list[tuple[Array, Array]]
 
 
 def initial(key: PRNGKeyArray, outputs: int) -> Weights:
-    """Make the initial weights of three convolutions and two dense layers.
-
-    The weights are drawn from a He normal distribution, except in the last layer. The weights of the last layer are
-    zero, so that the untrained network predicts zero.
-    """
+    """Make the initial weights of three convolutions and two dense layers."""
     widths = [12, *CHANNELS]
     shapes = [(3, 3, a, b) for a, b in itertools.pairwise(widths)]
     dense = [(2 * CHANNELS[-1], 64), (64, outputs)]
@@ -35,10 +31,7 @@ def initial(key: PRNGKeyArray, outputs: int) -> Weights:
 
 
 def apply(weights: Weights, x: Float[Array, "n h w 3"]) -> Float[Array, "n k"]:
-    """Apply the network to images whose sides are multiples of 8.
-
-    The convolutions have no stride, because gradients of strided convolutions are slow on a CPU.
-    """
+    """Apply the network to images whose sides are multiples of 8."""
     n, h, w, c = x.shape
     x = x.reshape(n, h // 2, 2, w // 2, 2, c).transpose(0, 1, 3, 2, 4, 5).reshape(n, h // 2, w // 2, 4 * c)
     for index, (kernel, bias) in enumerate(weights[:-2]):
@@ -54,19 +47,7 @@ def apply(weights: Weights, x: Float[Array, "n h w 3"]) -> Float[Array, "n k"]:
 def fit(
     key: PRNGKeyArray, images: np.ndarray, targets: np.ndarray, *, steps: int
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Train a network to predict `targets` from `images`.
-
-    Args:
-        key: Random key.
-        images: Training images, uint8 `(n, h, w, 3)`.
-        targets: Float or bool `(n, k)`. This function standardises float targets, and the loss is the squared error.
-            For bool targets, the loss is the cross-entropy.
-        steps: Number of steps of Adam, with BATCH images each.
-
-    Returns:
-        A function from images, uint8 `(m, h, w, 3)`, to predictions, `(m, k)`. The predictions are logits if
-        `targets` is bool, and otherwise have the unit of `targets`.
-    """
+    """Train a network to predict `targets` from `images`."""
     logits = targets.dtype == bool
     centre, scale = (0.0, 1.0) if logits else (targets.mean(0), targets.std(0))
     wanted = jnp.asarray((targets - centre) / scale, jnp.float32)

@@ -7,13 +7,7 @@ CLASS = "scissors"
 
 
 def stamps() -> dict[str, float]:
-    """Time the first steps of a new user, such as the imports, the first image, a gradient and 64 simulated falls.
-
-    The imports stand inside the function, because they are the first step.
-
-    Returns:
-        Seconds from the call to the end of each step, by name of the step.
-    """
+    """Time the first steps of a new user, such as the imports, the first image, a gradient and 64 simulated falls."""
     begun = time.perf_counter()
     found: dict[str, float] = {}
 

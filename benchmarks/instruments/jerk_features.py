@@ -18,10 +18,7 @@ NOISE = 0.05  # standard deviation of the measured log mass, about 5 % of the ma
 
 
 class Sight(NamedTuple):
-    """Properties computed from the shapes of b objects.
-
-    The field `rigid` has the mass properties of each object at 17 fill levels of its interior, from empty to full.
-    """
+    """Properties computed from the shapes of b objects."""
 
     profile: np.ndarray  # (b, 10) m: radius of the base, height, greatest radius, radii at seven heights
     low: np.ndarray  # (b,) m, height of the lowest point in the mesh frame
@@ -31,12 +28,7 @@ class Sight(NamedTuple):
 
 
 def look(body: objects.Body) -> tuple[np.ndarray, float, np.ndarray]:
-    """Compute the properties of one object. `Sight` contains the same properties of several objects.
-
-    Returns:
-        Profile (radii and height), height of the lowest point in the mesh frame, and mass properties for each value of
-        `FILLS`, the share of the object's interior that is filled. `Sight` gives their shapes and units.
-    """
+    """Compute the properties of one object. `Sight` contains the same properties of several objects."""
     points = np.asarray(body.vertices)[np.unique(np.asarray(body.faces))]
     low = float(points[:, 2].min())
     radius, level = np.hypot(points[:, 0], points[:, 1]), (points[:, 2] - low).round(5)
@@ -59,19 +51,7 @@ def weighed(starts: Starts) -> np.ndarray:
 
 
 def canonical(pose: np.ndarray, condition: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotate or mirror each trajectory's start by a symmetry of the pad, so that the push is 0 to 45 degrees from +x.
-
-    A start consists of the object's position in the first frame and of the push. The push is the acceleration of the
-    object in the frame of the pad, opposite to the acceleration of the pad.
-
-    Args:
-        pose: Poses in the first frame, `(n, 7)`.
-        condition: Conditions of `Perturbed`, `(n, 3)`. The first two columns are the acceleration of the pad (m/s^2).
-            The third one is not used.
-
-    Returns:
-        Positions on the pad (m) and pushes (m/s^2), `(n, 2)` each.
-    """
+    """Rotate or mirror starts by a symmetry of the pad, so that the push is 0 to 45 degrees from +x."""
     push = -np.asarray(jerk(condition).acceleration)
     sign = np.where(push < 0, -1, 1)
     push, place = push * sign, pose[:, :2] * sign
@@ -80,25 +60,7 @@ def canonical(pose: np.ndarray, condition: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def tipping(rigid: np.ndarray, base: np.ndarray, push: np.ndarray, time: np.ndarray, friction: float) -> np.ndarray:
-    """Compute two ratios that decide whether a standing object topples over the edge of its base.
-
-    The object begins to tip at the acceleration g b / h, where b is the radius of the base and h is the height of the
-    centre of mass. The first ratio is the acceleration divided by g b / h. The second ratio is the energy at the end of
-    the push divided by the energy that lifts the centre of mass over the edge. Both ratios exceed 1 for an object that
-    topples. The second ratio takes into account that friction limits the force of the push. If the push is stronger
-    than the friction, the function replaces it by a longer push with the force of the friction and the same impulse.
-
-    Args:
-        rigid: Mass (kg), height of the centre of mass (m), and inertia about a horizontal axis through the centre of
-            mass (kg m^2), `(n, 3)`.
-        base: Radius of the base (m), `(n,)`.
-        push: Acceleration (m/s^2), `(n,)`.
-        time: Duration of the push (s), `(n,)`.
-        friction: A typical coefficient of friction, because the true one is hidden.
-
-    Returns:
-        The first ratio and the logarithm of the second ratio, `(n, 2)`.
-    """
+    """Ratios that exceed 1 for an object that topples: acceleration over g b / h, and energy over that of tipping."""
     mass, height, inertia = rigid.T
     force, lasts = np.minimum(push, friction * G), time * np.maximum(1, push / (friction * G))
     begin = np.maximum(mass * (force * height - G * base), 0) / (inertia + mass * (base**2 + height**2))
@@ -112,19 +74,7 @@ def tipping(rigid: np.ndarray, base: np.ndarray, push: np.ndarray, time: np.ndar
 def shaken(
     scenario: physics.Perturbed, items: list[objects.Body], starts: Starts, touch: np.ndarray | None
 ) -> np.ndarray:
-    """Compute features from which a classifier predicts the outcomes of trajectories on the jerked pad.
-
-    The objects must be solids of revolution, such as bottles.
-
-    Args:
-        scenario: The scenario.
-        items: The objects.
-        starts: Initial states of trajectories of these objects, with one row for each trajectory.
-        touch: Measured logarithm of the mass in kg, `(n, 1)`. None: return features from vision alone.
-
-    Returns:
-        Features, `(n, k)`.
-    """
+    """Compute features from which a classifier predicts the outcomes of trajectories on the jerked pad."""
     seen = sight(items)
     friction = float(np.mean(scenario.friction))
     place, push = canonical(starts.pose, starts.condition)

@@ -26,15 +26,7 @@ SNAP = 0.9986  # cosine of 3 degrees. An object that leans less than this from a
 
 
 def support(points: np.ndarray, level: float) -> np.ndarray:
-    """Compute the support polygon of an object.
-
-    Args:
-        points: Points of the object (m), `(n, 3)`, with z upwards.
-        level: Height (m). The object stands on all points that are less than `level` above the lowest point.
-
-    Returns:
-        Corners of the polygon in counter-clockwise order (m), `(k, 2)`. Two corners if the points lie on a line.
-    """
+    """Compute the support polygon of an object."""
     low = np.unique(points[points[:, 2] < points[:, 2].min() + level, :2].round(7), axis=0)
     try:
         return low[ConvexHull(low).vertices]
@@ -44,18 +36,7 @@ def support(points: np.ndarray, level: float) -> np.ndarray:
 
 
 def margins(corners: np.ndarray, place: np.ndarray) -> list[float]:
-    """Distances of a point from the edges of a support polygon.
-
-    Args:
-        corners: Corners of the polygon (m), `(k, 2)`.
-        place: The point (m), `(2,)`.
-
-    Returns:
-        Four numbers. The first is the distance from the nearest edge (m). The other three describe the nearest edge
-        whose outward normal has a y component above 0.2 (+y is downhill), or the nearest edge if there is no such edge.
-        They are the distance from this edge (m), its length (m), and the y component of its outward unit normal.
-        Distances are positive inside of the polygon and negative outside.
-    """
+    """Distances of a point from the edges of a support polygon."""
     along = np.roll(corners, -1, 0) - corners
     length = np.linalg.norm(along, axis=1) + 1e-9
     outward = np.stack([along[:, 1], -along[:, 0]], 1) / length[:, None]
@@ -68,20 +49,7 @@ def margins(corners: np.ndarray, place: np.ndarray) -> list[float]:
 def balance(
     corners: np.ndarray, centre: np.ndarray, friction: np.ndarray, slope: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Predict by statics how a body on the slope moves, and where the body presses on the pad.
-
-    There is one prediction for each row of `centre` and `friction`, which are hidden properties of the body.
-
-    Args:
-        corners: Corners of the support polygon (m), `(k, 2)`.
-        centre: Centres of mass (m), `(n, 3)`, with z above the pad.
-        friction: Coefficients of friction, `(n,)`.
-        slope: Angle of the slope (rad).
-
-    Returns:
-        The motion, `(n,)`, which is 0 for tipping, 1 for sliding and 2 for sticking, and the centre of pressure (m),
-        `(n, 2)`. A body that tips presses on the edge over which it tips.
-    """
+    """Predict by statics how a body on the slope moves, and where the body presses on the pad."""
     grip = np.minimum(friction, math.tan(slope))
     pressure = centre[:, :2] + (centre[:, 2] * grip)[:, None] * np.array([0.0, 1.0])
     along = np.roll(corners, -1, 0) - corners
@@ -103,15 +71,7 @@ def drawn_centres(body: objects.Body, scenario: physics.Inclined) -> np.ndarray:
 
 
 def levelled(rotation: np.ndarray, ups: np.ndarray) -> np.ndarray:
-    """Rotate an object that lies almost on a stable face until it lies on the face exactly.
-
-    Args:
-        rotation: Rotation of the object, `(3, 3)`.
-        ups: Directions in the mesh frame that point up when the object lies on a stable face, `(k, 3)`.
-
-    Returns:
-        The corrected rotation, or `rotation` itself if no direction is within 3 degrees of the vertical.
-    """
+    """Rotate an object that lies almost on a stable face until it lies on the face exactly."""
     up = rotation @ ups[(ups @ rotation[2]).argmax()]
     if up[2] < SNAP:
         return rotation
@@ -119,36 +79,13 @@ def levelled(rotation: np.ndarray, ups: np.ndarray) -> np.ndarray:
 
 
 def pressed(starts: Starts) -> np.ndarray:
-    """Exact value of the quantity that the sense of touch measures: the centre of pressure.
-
-    Returns:
-        `(-My, Mx) / Fz` of the wrench (m), `(n, 2)`, nan without contact.
-    """
+    """Exact value of the quantity that the sense of touch measures: the centre of pressure."""
     force = np.where(starts.wrench[:, 2] > 0, starts.wrench[:, 2], np.nan)
     return np.stack([-starts.wrench[:, 4], starts.wrench[:, 3]], 1) / force[:, None]
 
 
 def laid(scenario: physics.Inclined, items: list[objects.Body], starts: Starts, touch: np.ndarray | None) -> np.ndarray:
-    """Compute features from which a classifier predicts the outcomes of trajectories on the slope.
-
-    The objects may have any shape. The features include the probabilities of tipping, sliding and sticking. For this
-    purpose, each of `DRAWS` random draws of the hidden contents is combined with each of `FRICTIONS` coefficients of
-    friction, and `balance` predicts the motion for each combination. The probability of a motion is the weighted share
-    of the combinations for which it is predicted. From vision alone, all combinations have equal weights. With touch,
-    the weight of a combination is the likelihood of the measured centre of pressure.
-
-    Noise with the standard deviations `SEEN` is added to the pose in the first frame. Some objects have slipped by some
-    micrometres before this frame, and an exact pose would reveal the slip to the classifier.
-
-    Args:
-        scenario: The scenario.
-        items: The objects.
-        starts: Starts of the trajectories, one row each.
-        touch: Measured centre of pressure (m), `(n, 2)`, nan without contact. None: return features from vision alone.
-
-    Returns:
-        Features, `(n, k)`.
-    """
+    """Compute features from which a classifier predicts the outcomes of trajectories on the slope."""
     centres = [np.tile(drawn_centres(body, scenario), (FRICTIONS, 1)) for body in items]
     friction = np.repeat(np.linspace(*scenario.friction, 2 * FRICTIONS + 1)[1::2], DRAWS)
     rng = np.random.default_rng(1)

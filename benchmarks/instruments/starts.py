@@ -21,10 +21,7 @@ _settled = jax.jit(jax.vmap(objects.rigid, in_axes=(None, 0, 0)))  # the same fo
 
 
 class Starts(NamedTuple):
-    """Starts and outcomes of trajectories, with one row for each trajectory.
-
-    A start is the initial state of a trajectory. The outcome is how the trajectory ends, such as by toppling.
-    """
+    """Starts and outcomes of trajectories, with one row for each trajectory."""
 
     body: np.ndarray  # (n,) index of the object
     pose: np.ndarray  # (n, 7) pose in the first frame
@@ -38,43 +35,19 @@ class Starts(NamedTuple):
 
 
 def bodies(categories: tuple[str, ...], count: int, first: int = 0) -> list[objects.Body]:
-    """Make objects of the given classes, such as "bottle". The classes alternate from object to object.
-
-    Args:
-        categories: Names of the classes.
-        count: Number of objects.
-        first: Number of the first object. The number of an object is the seed of its random key, and selects its class.
-    """
+    """Make objects of the given classes, such as "bottle". The classes alternate from object to object."""
     numbers = range(first, first + count)
     return [objects.make(jax.random.key(i), categories[i % len(categories)]) for i in numbers]
 
 
 def filled(body: objects.Body, fill: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mass properties of a body at several fill levels.
-
-    The shell has the nominal mass. The contents settled while +z of the mesh frame pointed upwards.
-
-    Args:
-        body: The body.
-        fill: Filled shares of the interior's volume, `(k,)`.
-
-    Returns:
-        Mass (kg), `(k,)`, centre of mass in the mesh frame (m), `(k, 3)`, and inertia (kg m^2), `(k, 3, 3)`.
-    """
+    """Mass properties of a body at several fill levels."""
     mass, com, inertia = _settled(body, jnp.asarray(fill, jnp.float32), jnp.ones(len(fill)))
     return np.asarray(mass), np.asarray(com), np.asarray(inertia)
 
 
 def rigid_of(items: list[objects.Body], traj: physics.Trajectory) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mass properties of the object of each trajectory. The trajectories must be sorted by object.
-
-    Args:
-        items: The objects.
-        traj: The trajectories.
-
-    Returns:
-        Mass (kg), `(n,)`, centre of mass in the mesh frame (m), `(n, 3)`, and inertia (kg m^2), `(n, 3, 3)`.
-    """
+    """Mass properties of the object of each trajectory. The trajectories must be sorted by object."""
     owner, parts = np.asarray(traj.body), []
     for index, body in enumerate(items):
         own = jax.tree.map(lambda x, mine=owner == index: x[mine], traj.hidden)
@@ -92,16 +65,7 @@ def roll(
     again: int = 0,
     reroll: tuple[str, ...] = (),
 ) -> Starts:
-    """Simulate trajectories of each object, and repeat some of them with other hidden properties (such as friction).
-
-    Args:
-        key: Random key.
-        items: The objects.
-        scenario: The scenario.
-        num: Number of trajectories of each object.
-        again: Number of trajectories of each object that are repeated from the same initial state.
-        reroll: Fields of `physics.Hidden` that are drawn again for the repetitions.
-    """
+    """Simulate trajectories of each object, and repeat some of them with other hidden properties (such as friction)."""
     key, fresh = jax.random.split(key)
     with tqdm(total=len(items) * num, unit="starts") as bar:
         traj = physics.simulate(key, items, Sensor(), scenario, num, progress=lambda n: bar.update(n - bar.n))
@@ -132,15 +96,7 @@ def roll(
 
 
 def draw(items: list[objects.Body], starts: Starts) -> tuple[np.ndarray, np.ndarray]:
-    """Render the first frame of each trajectory.
-
-    Args:
-        items: The objects.
-        starts: Starts of the trajectories, sorted by object.
-
-    Returns:
-        Visual and tactile images, uint8 `(n, 64, 64, 3)` each.
-    """
+    """Render the first frame of each trajectory."""
 
     def one(index: int) -> tuple[np.ndarray, ...]:
         own = starts.body == index
@@ -155,15 +111,7 @@ def draw(items: list[objects.Body], starts: Starts) -> tuple[np.ndarray, np.ndar
 
 
 def kept(folder: Path | None, name: str, make: Callable[[], Starts]) -> Starts:
-    """Load the initial states of trajectories from a file. If there is no file, make the states and write the file.
-
-    Each initial state is stored together with the outcome of its trajectory.
-
-    Args:
-        folder: Folder of the file. None: make the initial states and write nothing.
-        name: Name of the file, without `.npz`.
-        make: Function that makes the initial states and their outcomes.
-    """
+    """Load the initial states of trajectories from a file. If there is no file, make the states and write the file."""
     path = None if folder is None else folder / f"{name}.npz"
     if path is not None and path.exists():
         with np.load(path) as file:

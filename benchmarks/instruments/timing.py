@@ -1,25 +1,33 @@
-"""Timing of several functions, to compare their durations."""
+"""Durations of function calls, in this process or in new ones."""
 
+import json
+import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 
+PROGRAM = "import json, sys; from {module} import {name}; print(json.dumps({name}(*json.loads(sys.argv[1]))))"
+
+
+def fresh(function: str, *arguments: Any, cache: Path | None = None) -> Any:
+    """Call a function in a new process, and return its result."""
+    module, name = function.rsplit(".", 1)
+    environment = os.environ | {"TF_CPP_MIN_LOG_LEVEL": "3"}
+    if cache is not None:
+        environment["JAX_COMPILATION_CACHE_DIR"] = str(cache)
+    command = [sys.executable, "-c", PROGRAM.format(module=module, name=name), json.dumps(arguments)]
+    done = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE, text=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
 
 def in_turn(*calls: Callable[[], object], repeats: int = 5) -> np.ndarray:
-    """Measure the durations of functions in alternation, so that a busy machine slows all of them alike.
-
-    Each function is called once before the measurement, so that its compilation is not measured. A call ends when
-    its arrays are ready.
-
-    Args:
-        calls: Functions without arguments.
-        repeats: Number of measured calls of each function.
-
-    Returns:
-        Seconds of each call, `(repeats, len(calls))`.
-    """
+    """Measure the durations of functions in alternation, so that a busy machine slows all of them alike."""
     seconds = np.empty((repeats + 1, len(calls)))
     for row in seconds:
         for i, call in enumerate(calls):

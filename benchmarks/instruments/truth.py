@@ -1,4 +1,7 @@
-"""Reference depth images from the ray tracer Embree, with which rendered depth images are compared."""
+"""Public meshes, and reference depth images from the ray tracer Embree."""
+
+import importlib.util
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -10,13 +13,18 @@ import sts_jax as sts
 from sts_jax import objects
 
 
-def body_mesh(body: objects.Body, pose: jax.Array) -> trimesh.Trimesh:
-    """Make the mesh of a body in the sensor frame, in float64.
+def public_meshes() -> Path:
+    """Find the folder of the meshes of the package miniworld (Farama Foundation, Apache 2.0)."""
+    found = importlib.util.find_spec("miniworld")
+    if found is None or found.origin is None:
+        raise ModuleNotFoundError(
+            "the test meshes are in the package miniworld, which is missing: pip install -e '.[test]'"
+        )
+    return Path(found.origin).parent / "meshes"
 
-    Args:
-        body: The body.
-        pose: Pose of the body, `(7,)`.
-    """
+
+def body_mesh(body: objects.Body, pose: jax.Array) -> trimesh.Trimesh:
+    """Make the mesh of a body in the sensor frame, in float64."""
     faces = np.asarray(body.faces)
     faces = faces[np.any(faces != faces[:, :1], axis=1)]
     turn = trimesh.transformations.quaternion_matrix(np.asarray(pose[3:], float))[:3, :3]
@@ -27,17 +35,7 @@ def body_mesh(body: objects.Body, pose: jax.Array) -> trimesh.Trimesh:
 def embree(
     mesh: trimesh.Trimesh, camera: sts.optics.Camera, shape: tuple[int, int], *, two_sided: bool = False
 ) -> np.ndarray:
-    """Trace a depth image of the triangles that face the camera, with the ray tracer Embree.
-
-    Args:
-        mesh: The triangles in the sensor frame.
-        camera: The camera.
-        shape: Height and width of the image in pixels.
-        two_sided: Include triangles that face away from the camera.
-
-    Returns:
-        Depth along the optical axis (m), float64, `shape`, infinite where a ray hits no triangle.
-    """
+    """Trace a depth image of the triangles that face the camera, with the ray tracer Embree."""
     towards = np.einsum("ij,ij->i", mesh.face_normals, mesh.triangles[:, 0] + [0, 0, camera.distance]) < 0
     scene = EmbreeScene()
     TriangleMesh(scene, np.ascontiguousarray(mesh.triangles[towards | two_sided], np.float32))
@@ -54,29 +52,13 @@ def embree(
 
 
 def interior(depth: np.ndarray, *, span: float = 1e-3) -> np.ndarray:
-    """Find the pixels whose 3x3 neighbourhood has only finite depths, which differ by less than `span`.
-
-    Args:
-        depth: Depth image (m), `(h, w)`, infinite where the ray of a pixel hits nothing.
-        span: Limit for the largest minus the smallest depth of the neighbourhood (m).
-
-    Returns:
-        True for interior pixels, `(h, w)`. Pixels at the edge of the image are not interior.
-    """
+    """Find the pixels whose 3x3 neighbourhood has only finite depths, which differ by less than `span`."""
     around = neighbours(np.where(np.isfinite(depth), depth, 1e9), 1e9)
     return (around.max(0) < 1e8) & (around.max(0) - around.min(0) < span)
 
 
 def neighbours(image: np.ndarray, beyond: float | None = None) -> np.ndarray:
-    """Stack the 3x3 neighbourhood of every pixel.
-
-    Args:
-        image: The image, `(h, w)`.
-        beyond: Value outside of the image. None: the image repeats its edge.
-
-    Returns:
-        The nine values of each neighbourhood, row by row, `(9, h, w)`.
-    """
+    """Stack the 3x3 neighbourhood of every pixel."""
     height, width = image.shape
     fill = {"mode": "edge"} if beyond is None else {"constant_values": beyond}
     padded = np.pad(image, 1, **fill)

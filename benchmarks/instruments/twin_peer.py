@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 import sts_jax as sts
-from benchmarks.instruments.shown import Shown
+from benchmarks.instruments.peers import Shown
 from sts_jax.hardware import Lens, twin
 from sts_jax.hardware.twin import photometry
 
@@ -22,22 +22,10 @@ _START = b"\xff\xd8\xff"  # first bytes of a JPEG image
 
 
 class TwinPeer:
-    """A digital twin with a camera at the address `url` and an LED controller at a serial port.
-
-    The argument `path` is a symbolic link to the port. The twin writes its log and its frames to files whose names are
-    `path` with the suffixes `.jsonl` and `.mjpeg`.
-    """
+    """A digital twin with a camera at the address `url` and an LED controller at a serial port."""
 
     def __init__(self, path: Path, *, fps: float, lag_s: float, exposure_s: float, size: tuple[int, int]) -> None:
-        """Render the first images, and start the camera and the controller.
-
-        Args:
-            path: Path at which a symbolic link to the controller's port is created.
-            fps: Frames per second of the camera.
-            lag_s: Time from the end of an exposure to the sending of the frame (s).
-            exposure_s: Exposure time (s).
-            size: Width and height of the frames (pixels).
-        """
+        """Render the first images, and start the camera and the controller."""
         width, height = size
         sensor = sts.Sensor()
         scene = twin.ObjectScene(
@@ -68,13 +56,7 @@ class TwinPeer:
         self.twin.close()
 
     def shown(self) -> dict[int, Shown]:
-        """Read the frame numbers and the brightness of the LEDs from the twin's log.
-
-        Frames are numbered from 0. The brightness is averaged over the exposure time of the frame.
-
-        Returns:
-            A dictionary with one entry per frame. The key is the checksum of the image (from the function `key`).
-        """
+        """Read the frame numbers and the brightness of the LEDs from the twin's log."""
         _, *parts = self._record.read_bytes().split(_START)
         frames = zip(parts, twin.read_log(self._log), strict=True)
         return {key(photometry.decode(_START + part)): Shown(frame.index, frame.light) for part, frame in frames}
