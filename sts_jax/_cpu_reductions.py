@@ -24,10 +24,7 @@ def maximum(values: Array) -> Array:
 
 
 def cumsum(counts: Array) -> Int[Array, "n"]:
-    """Cumulative sum of a vector of integers or flags, computed in float32 by products with triangular matrices.
-
-    The sum of all values must be below 2^24, because float32 cannot represent every integer above this limit.
-    """
+    """Cumulative sum of integers or flags, in float32 by triangular matrices. The total must be below 2^24."""
     size = len(counts)
     rows = -(-size // _LANES)
     table = jnp.pad(counts.astype(jnp.float32), (0, rows * _LANES - size)).reshape(rows, _LANES)
@@ -39,10 +36,7 @@ def cumsum(counts: Array) -> Int[Array, "n"]:
 
 
 def flatnonzero(flags: Bool[Array, "n"]) -> Int[Array, "n"]:
-    """Indices of the true flags in ascending order.
-
-    The result has n elements, like `flags`. The indices come first, and every element after them has the value n.
-    """
+    """Indices of the true flags in ascending order, followed by the value n up to the length n of `flags`."""
     size = len(flags)
     place = jnp.where(flags, cumsum(flags) - 1, size)
     return jnp.full(size, size, jnp.int32).at[place].set(jnp.arange(size, dtype=jnp.int32), mode="drop")

@@ -6,12 +6,7 @@ import jax
 
 
 def check_key(key: Any) -> None:
-    """Check that an argument is one JAX key, made by `jax.random.key` or by the older `jax.random.PRNGKey`.
-
-    Raises:
-        TypeError: The argument is not a key, or it is an array of several keys. The message describes the argument
-            and the remedy.
-    """
+    """Raise a TypeError unless an argument is one key, from `jax.random.key` or `jax.random.PRNGKey`."""
     if isinstance(key, jax.Array) and jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key):
         if key.shape:
             raise TypeError(f"key has shape {key.shape}, but it must be one key: call the function once for each key")

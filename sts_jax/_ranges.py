@@ -1,11 +1,6 @@
-"""Allowed ranges of a dataclass's fields, declared in their metadata.
+"""Allowed ranges of a dataclass's fields, declared in their metadata, as in `field(default=4 / 3, metadata=POSITIVE)`.
 
-`aspect: float = dataclasses.field(default=4 / 3, metadata=POSITIVE)` declares that every number of the field must be
-> 0. The metadata's keys are "above" (>), "at_least" (>=), "below" (<), "at_most" (<=), "whole" (a whole
-number) and "static" (JAX compiles a program for each value).
-
-`limits` compares the numbers of one field with the limits in its metadata. `check` raises an error if a field of a
-dataclass violates its limits.
+The metadata's keys are "above" (>), "at_least" (>=), "below" (<), "at_most" (<=), "whole" and "static".
 """
 
 import dataclasses
@@ -24,16 +19,10 @@ _SMALLEST = float(np.finfo(np.float32).tiny)  # float32 arithmetic flushes small
 
 
 def limits(metadata: Mapping[str, Any], array: Any) -> list[tuple[Any, str]]:
-    """Compare the numbers of a dataclass's field with the range that the field allows.
-
-    Args:
-        metadata: Metadata of the field. The keys of its limits are "above" (>), "at_least" (>=), "below" (<) and
-            "at_most" (<=).
-        array: The numbers, a NumPy array or a traced JAX array.
+    """Compare numbers, a NumPy or traced JAX array, with the limits in a field's metadata.
 
     Returns:
-        One pair (flag, text) for each limit. The flag is True if all numbers satisfy the limit, and the text describes
-        the limit for an error message.
+        One pair for each limit: True if all numbers satisfy it, and a text such as "it must be > 0".
     """
     found = []
     if "above" in metadata:
@@ -48,14 +37,7 @@ def limits(metadata: Mapping[str, Any], array: Any) -> list[tuple[Any, str]]:
 
 
 def check(config: Any) -> None:
-    """Check each field of a dataclass against the limits in its metadata. A field without metadata is not checked.
-
-    The value of a checked field must be a number or None. None is always allowed. If the metadata has the entry
-    `"whole": True`, the number must be an integer.
-
-    Raises:
-        ValueError: A number is out of its field's range, not finite, or not whole.
-    """
+    """Raise a ValueError for the first number of a dataclass that is not finite, not whole or out of its range."""
     for field in dataclasses.fields(config):
         value, metadata = getattr(config, field.name), field.metadata
         if not metadata or value is None:

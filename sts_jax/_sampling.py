@@ -1,13 +1,7 @@
-"""Bilinear interpolation of images at points given by column and row (pixels).
+"""Bilinear interpolation of images at points given by column and row (pixels), whole numbers at pixel centres.
 
-The column and the row are whole numbers at the centre of a pixel.
-
-There is one function for each pattern of access: `bilinear` for any points of one image, `bilinear_batch` for many
-points in each of several small images with channels, and `shifted` for the same offset from every pixel.
-
-In `bilinear` and `bilinear_batch`, a point outside the image gets the value of the nearest point inside. To get zero
-there, pad the image with a ring of zeros. With `bilinear(..., wrap=True)`, the image repeats beyond its border. For
-`shifted`, the caller adds a wide border to the image, and a point outside the image gets a value of this border.
+One function for each pattern of access. In `bilinear` and `bilinear_batch`, a point outside the image gets the value of
+the nearest point inside. To get zero there, pad the image with a ring of zeros.
 """
 
 import jax
@@ -18,18 +12,9 @@ from jaxtyping import Array, Float, Int
 def bilinear(
     image: Float[Array, "h w *c"], column: Float[Array, "*n"], row: Float[Array, "*n"], *, wrap: bool = False
 ) -> Float[Array, "..."]:
-    """Interpolate an image at any points.
+    """Interpolate an image of at least 2x2 pixels at any points.
 
-    Args:
-        image: Values of the pixels. The first two axes are the rows and the columns. Any number of channel axes may
-            follow. If `wrap` is False, the image must have at least 2x2 pixels.
-        column: Columns of the points (pixels). The centre of a pixel has a whole number as its column.
-        row: Rows of the points (pixels). The centre of a pixel has a whole number as its row.
-        wrap: If True, the image repeats beyond its border. If False, a point outside has the value of the nearest point
-            inside.
-
-    Returns:
-        Values at the points. Their shape is the shape of `column`, followed by the channel axes of `image`.
+    With `wrap`, the image repeats beyond its border, and may have any size.
     """
     height, width = image.shape[:2]
     if wrap:
@@ -47,16 +32,7 @@ def bilinear(
 def bilinear_batch(
     images: Float[Array, "n h w c"], column: Float[Array, "n m"], row: Float[Array, "n m"]
 ) -> Float[Array, "n m c"]:
-    """Interpolate each of n images at m points. The derivative with respect to the images is fast to compute.
-
-    Args:
-        images: Images with c channels, at least 2x2 pixels each.
-        column: Columns of the points in each image (pixels). The centre of a pixel has a whole number as its column.
-        row: Rows of the points in each image (pixels). The centre of a pixel has a whole number as its row.
-
-    Returns:
-        Values at the points. A point outside its image has the value of the nearest point inside.
-    """
+    """Interpolate each of n images at m points. The derivative by the images is fast to compute."""
     count, height, width, channels = images.shape
     # The four neighbours of a point lie side by side in a table, so that one look-up finds them.
     corners = [images[:, i : height - 1 + i, j : width - 1 + j] for i in (0, 1) for j in (0, 1)]
@@ -71,19 +47,14 @@ def bilinear_batch(
 def shifted(
     around: Float[Array, "a b"], columns: Float[Array, ""], rows: Float[Array, ""], shape: tuple[int, int]
 ) -> Float[Array, "h w"]:
-    """Shift an image by an offset, with interpolation between its pixels.
+    """Shift an image (h, w) by an offset (pixels): pixel (i, j) gets the value at row i + rows, column j + columns.
 
     Args:
-        around: Array of the shape (3 h + 2, 3 w + 2). It contains the image (h, w) and a border around the image, which
-            has h + 1 rows above and below, and w + 1 columns on the left and on the right. The border has the values
-            that the shift moves into the image.
-        columns: Horizontal part of the offset (pixels). It is clipped to [-w, w].
-        rows: Vertical part of the offset (pixels). It is clipped to [-h, h].
-        shape: Height h and width w of the image without the border (pixels).
-
-    Returns:
-        Shifted image (h, w). The pixel at row i and column j has the value of the image without the border at row
-        i + rows and column j + columns, or a value of the border if this point is outside the image.
+        around: The image with a border of h + 1 rows above and below, and w + 1 columns on the left and on the right.
+            The border has the values that the shift moves into the image.
+        columns: Horizontal part of the offset, clipped to [-w, w].
+        rows: Vertical part of the offset, clipped to [-h, h].
+        shape: (h, w).
     """
     height, width = shape
     columns, rows = jnp.clip(columns, -width, width), jnp.clip(rows, -height, height)
@@ -96,16 +67,13 @@ def shifted(
 
 
 def _split(place: Float[Array, "*n"], size: int) -> tuple[Int[Array, "*n"], Float[Array, "*n"]]:
-    """Split positions on a periodic line of pixels into the index of the pixel before each and the distance from it."""
+    """Index of the pixel before each position on a periodic line of pixels, and the distance from it."""
     before = jnp.floor(place)
     return before.astype(jnp.int32) % size, place - before
 
 
 def _split_within(place: Float[Array, "*n"], size: int) -> tuple[Int[Array, "*n"], Float[Array, "*n"]]:
-    """Split positions on a line of pixels into the index of the pixel before each and the distance from it.
-
-    Positions are clipped to the line. The index is at most `size - 2`, so that another pixel follows.
-    """
+    """As `_split`, with positions clipped to the line. The index is at most `size - 2`."""
     place = jnp.clip(place, 0, size - 1)
     before = jnp.minimum(jnp.floor(place), size - 2)
     return before.astype(jnp.int32), place - before

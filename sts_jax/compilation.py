@@ -14,29 +14,19 @@ def cache_folder() -> Path:
 
 
 def enable_compilation_cache(folder: str | os.PathLike[str] | None = None) -> Path | None:
-    """Let JAX keep compiled programs on disk, so that the next session loads them instead of compiling them again.
-
-    Call this function once, before the first computation. It changes JAX's settings for the whole process. The commands
-    in `experiments` call it. The library itself never calls it.
-
-    On a CPU, XLA logs an error about processor features for each program that it loads from the cache. This message is
-    harmless. XLA stores two of its own tuning options with the program as if these were features of a processor, but no
-    processor has such features (JAX issue 38445). Set the environment variable TF_CPP_MIN_LOG_LEVEL=3 before
-    `import jax` to hide the message.
+    """Let JAX keep compiled programs on disk, so that the next session loads them.
+     Call this function once, before the first computation. It changes JAX's settings for the whole process. The
+    commands in `experiments` call it; the library itself never does. On a CPU, XLA logs a harmless error about
+    processor features for each program that it loads (JAX issue 38445): set TF_CPP_MIN_LOG_LEVEL=3 before `import jax`
+    to hide it.
 
     Args:
-        folder: Folder of the cache. None selects the folder in the environment variable JAX_COMPILATION_CACHE_DIR. If
-            that variable is set to an empty string, nothing is cached. If the variable is not set, the cache is a
-            folder in `$XDG_CACHE_HOME/sts_jax`, by default in `~/.cache/sts_jax`. Each kind of processor has its own
-            folder there, because a program that was compiled for one kind may not run on another.
+        folder: Folder of the cache. None selects JAX_COMPILATION_CACHE_DIR, or, if that variable is not set, a folder
+            for this kind of processor in `$XDG_CACHE_HOME/sts_jax` (default `~/.cache/sts_jax`), because a program that
+            was compiled for one kind may not run on another.
 
     Returns:
-        The folder of the cache. The result is None if `folder` is None and JAX_COMPILATION_CACHE_DIR is set to an empty
-        string.
-
-    Raises:
-        OSError: The folder cannot be created.
-        ValueError: `folder` is an empty string.
+        The folder, or None if `folder` is None and JAX_COMPILATION_CACHE_DIR is empty: nothing is cached then.
     """
     if folder is None and "JAX_COMPILATION_CACHE_DIR" in os.environ:
         folder = os.environ["JAX_COMPILATION_CACHE_DIR"]

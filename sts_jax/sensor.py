@@ -33,52 +33,38 @@ class Sensor:
     The defaults are those of the paper (Rezaei-Shoshtari et al. 2021), where the paper gives a value.
     """
 
-    # Pinhole of the camera.
-    camera: Camera = dataclasses.field(default_factory=Camera)
-    # Size and stiffness of the gel, and limits of its deformation.
-    gel: Gel = dataclasses.field(default_factory=Gel)
+    camera: Camera = dataclasses.field(default_factory=Camera)  # Pinhole of the camera.
+    gel: Gel = dataclasses.field(default_factory=Gel)  # Size and stiffness of the gel, and limits of its deformation.
     # Internal lights: directional lights (`Lights`), or points at a finite distance (`Leds`).
     lights: Lights | Leds = dataclasses.field(default_factory=Lights)
-    # Reflectance of the skin's inner side.
-    phong: Phong = dataclasses.field(default_factory=Phong)
-    # Smoothing of the imprint, and shadows on the skin.
-    skin: Skin = dataclasses.field(default_factory=Skin)
-    # External light, and the view of it through the skin.
-    room: Room = dataclasses.field(default_factory=Room)
+    phong: Phong = dataclasses.field(default_factory=Phong)  # Reflectance of the skin's inner side.
+    skin: Skin = dataclasses.field(default_factory=Skin)  # Smoothing of the imprint, and shadows on the skin.
+    room: Room = dataclasses.field(default_factory=Room)  # External light, and the view of it through the skin.
     # Images whose shorter side is below this number of pixels are sampled every half pixel and filtered. Our choice.
     fine_below: int = dataclasses.field(default=128, metadata=NOT_NEGATIVE | STATIC)
 
     def check(self) -> None:
-        """Raise an error if a constant is out of range. For constants that `jit` traces, use `guard`.
+        """Raise a ValueError that names the field, its value and the limit, if a constant is out of range.
 
-        Every field must have the shape of its default value, be finite, and lie in its declared range. The
-        arrays of internal lights (`lights`) and external lights (`room`) may have any number of rows, one for each
-        light. There are further conditions:
+        Every field must be finite, have the shape of its default and lie in its declared range, and:
 
-        - The distance from the pinhole to the gel's inner face is at least `camera.near`, the smallest depth at which
-          objects are drawn. All objects that press on the gel are therefore drawn.
-        - `gel.max_depth`, the largest depth of the imprint in an equilibrium, is at most `gel.thickness`.
-        - Every light has one row in `colors` and one in `directions` or `positions`. No direction is zero.
-        - Every internal light is on the camera's side of the opaque skin. This means z <= 0 in every row of
-          `directions` (`Lights`) or `positions` (`Leds`).
-        - LEDs do not lie in the gel. They may lie beside the gel, where their light enters through its edges. They may
-          also lie behind the pinhole, because the camera casts no shadow.
+        - The pinhole is at least `camera.near` below the gel's inner face, so that objects that press are drawn.
+        - `gel.max_depth` is at most `gel.thickness`.
+        - Every light, internal or external, has one row in `colors` and one in `directions` or `positions`. No
+          direction is zero.
+        - Internal lights are on the camera's side of the opaque skin (z <= 0), and LEDs do not lie in the gel. They may
+          lie beside it, and behind the pinhole, because the camera casts no shadow.
 
-        Raises:
-            ValueError: A field is out of range. The message contains the field, its value and the allowed values.
+        Constants that `jit` traces cannot be checked: use `guard`.
         """
         _require(_conditions(self))
 
     def guard(self) -> tuple["Sensor", Bool[Array, ""] | bool]:
-        """Check a sensor whose constants may be traced by `jit`, and replace invalid traced constants.
+        """Check a sensor whose constants may be traced by `jit`.
 
         Returns:
-            A sensor and a flag. If all constants are in range, the sensor has the constants of `self` and the flag is
-            True. If a traced constant is out of range, all traced constants have their default values and the flag is
-            False. If any constant is traced, the flag is traced too.
-
-        Raises:
-            ValueError: A constant that is not traced is out of range, or a traced one has a wrong shape (see `check`).
+            The sensor and a flag. If a traced constant is out of range, all traced constants have their default values
+            and the flag is False. A constant that is not traced raises a ValueError, as in `check`.
         """
         flags = []
         for holds, message in _conditions(self):
@@ -106,33 +92,16 @@ class Sensor:
         return _plain(self)
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write all constants to a JSON file. An interruption leaves no incomplete file.
-
-        Args:
-            path: Path of the file.
-
-        Raises:
-            ValueError: A constant is out of range (see `check`).
-            OSError: The file cannot be written. The message names the file and the remedy.
-        """
+        """Write all constants to a JSON file, atomically."""
         self.check()
         write_json(Path(path), self.constants())
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> "Sensor":
-        """Read a sensor from a JSON file.
+        """Read a sensor from a file that `save` wrote, or from the sensor file of a real sensor.
 
-        Args:
-            path: Path of a file that `save` wrote, or of the file of a real sensor (`hardware.Device.save`). The entry
-                "device" of a real sensor's file is ignored.
-
-        Returns:
-            The sensor.
-
-        Raises:
-            FileNotFoundError: The file does not exist.
-            DamagedFileError: The file cannot be read or is not valid JSON. DamagedFileError is an OSError.
-            ValueError: A field is missing, unknown, of another shape or out of range (see `check`).
+        A missing field has its default value, and an unknown field raises a ValueError. The entry "device" of a real
+        sensor's file is ignored.
         """
         if not Path(path).exists():
             raise FileNotFoundError(
@@ -163,38 +132,27 @@ def _plain(value: Any) -> Any:
 
 
 def _typed(default: Any, value: Any, name: str, metadata: Mapping[str, Any] = MappingProxyType({})) -> Any:
-    """Convert the values of a file to the types of the default value, and check their shapes and ranges."""
+    """Convert the values of a file to the types of the default value. Missing fields keep the default value."""
     if not dataclasses.is_dataclass(default):
         _require(_value_conditions(default, value, name, metadata))
         if isinstance(default, tuple):
             return tuple(type(d)(v) for d, v in zip(default, value, strict=True))
         return type(default)(value) if isinstance(default, int | float) else jnp.asarray(value, jnp.float32)
     if not isinstance(value, dict):
-        known = ", ".join(field.name for field in dataclasses.fields(default))
         subject = f"field {name}" if name else "the content"
-        raise ValueError(f"{subject} is {value!r}, but it must be a JSON object with the fields {known}.")
-    if name == "lights":
-        default, value = _of_kind(value)
+        raise ValueError(f"{subject} is {value!r}, but it must be a JSON object.")
+    if name == "lights" and "kind" in value:
+        if value["kind"] not in list(_LIGHTS):
+            raise ValueError(f"field lights.kind is {value['kind']!r}, but it must be one of {', '.join(_LIGHTS)}.")
+        default, value = _LIGHTS[value["kind"]](), {k: v for k, v in value.items() if k != "kind"}
     fields = {field.name: field for field in dataclasses.fields(default)}
     prefix = f"{name}." if name else ""
-    for missing in [k for k in fields if k not in value]:
-        raise ValueError(f"field {prefix}{missing} is missing. Write the file again with Sensor.save.")
-    for unknown in [k for k in value if k not in fields]:
+    for unknown in sorted(value.keys() - fields.keys()):
         raise ValueError(f"field {prefix}{unknown} is unknown: use only the fields {', '.join(fields)}.")
-    typed = {k: _typed(getattr(default, k), value[k], prefix + k, field.metadata) for k, field in fields.items()}
-    if "colors" in typed:
-        _require(_row_conditions(name, typed))
+    typed = {k: _typed(getattr(default, k), v, prefix + k, fields[k].metadata) for k, v in value.items()}
+    if "colors" in fields:
+        _require(_row_conditions(name, vars(default) | typed))
     return dataclasses.replace(default, **typed)
-
-
-def _of_kind(value: dict[str, Any]) -> tuple[Lights | Leds, dict[str, Any]]:
-    """Default lights of the kind in a file, and the values of the file without the kind."""
-    kinds = ", ".join(_LIGHTS)
-    if "kind" not in value:
-        raise ValueError(f"field lights.kind is missing: add it with one of the values {kinds}.")
-    if value["kind"] not in list(_LIGHTS):
-        raise ValueError(f"field lights.kind is {value['kind']!r}, but it must be one of {kinds}.")
-    return _LIGHTS[value["kind"]](), {k: v for k, v in value.items() if k != "kind"}
 
 
 def _require(conditions: Iterator[_Condition]) -> None:
@@ -215,10 +173,7 @@ def _conditions(sensor: Sensor) -> Iterator[_Condition]:
     thickness, max_depth = _array(sensor.gel.thickness), _array(sensor.gel.max_depth)
     yield (
         distance > thickness,
-        lambda: (
-            f"field camera.distance is {distance:g}, but it must be > gel.thickness = {thickness:g}, so that the "
-            "pinhole is outside the gel."
-        ),
+        lambda: f"field camera.distance is {distance:g}, but it must be > gel.thickness = {thickness:g}.",
     )
     yield (
         near <= _ROUNDED * (distance - thickness),
@@ -233,23 +188,17 @@ def _conditions(sensor: Sensor) -> Iterator[_Condition]:
     )
     yield from _row_conditions("lights", vars(sensor.lights))
     yield from _row_conditions("room", vars(sensor.room))
-    yield from _light_conditions(sensor)
-
-
-def _light_conditions(sensor: Sensor) -> Iterator[_Condition]:
-    """Yield the conditions that lights lie on the camera's side of the gel's outer face, and LEDs outside the gel."""
     leds = isinstance(sensor.lights, Leds)
     name = "lights.positions" if leds else "lights.directions"
     rows = _array(sensor.lights.positions if isinstance(sensor.lights, Leds) else sensor.lights.directions)
     yield (
         (rows[:, 2] <= 0).all(),
         lambda: (
-            f"field {name} has the row {rows[rows[:, 2] > 0][0].tolist()}, but z must be <= 0 (the camera's side), "
-            "because the skin is opaque to light from outside."
+            f"field {name} has the row {rows[rows[:, 2] > 0][0].tolist()}, but z must be <= 0, on the camera's side of "
+            "the opaque skin."
         ),
     )
     if leds:
-        thickness = _array(sensor.gel.thickness)
         half = _ROUNDED * _array(sensor.gel.size) / 2
         inside = (abs(rows[:, :2]) <= half[None, :]).all(axis=1) & (rows[:, 2] >= -_ROUNDED * thickness)
         yield (
@@ -267,14 +216,13 @@ def _field_conditions(
     """Yield the conditions that every number is finite and in range. Raise a ValueError for a wrong type or shape."""
     if not dataclasses.is_dataclass(default):
         static = isinstance(default, int) or (isinstance(default, tuple) and isinstance(default[0], int))
-        numbers = value if isinstance(value, tuple) else (value,)
         if isinstance(default, tuple) and not isinstance(value, tuple):
             raise ValueError(f"field {name} is {value!r}, but it must be a tuple of {len(default)} numbers.")
         if isinstance(default, jax.Array) and not isinstance(value, jax.Array | np.ndarray):
             raise ValueError(f"field {name} is {value!r}, but it must be a NumPy or JAX array.")
+        numbers = value if isinstance(value, tuple) else (value,)
         if static and not all(isinstance(number, int | np.integer) for number in numbers):
-            whose = "its numbers" if isinstance(value, tuple) else "it"
-            raise ValueError(f"field {name} is {value!r}, but {whose} must have the type int or np.integer.")
+            raise ValueError(f"field {name} is {value!r}, but it must have the type int.")
         yield from _value_conditions(default, value, name, metadata)
         return
     if type(value) is not type(default):

@@ -1,7 +1,5 @@
 """Rotations and poses against SciPy and 4x4 matrices, gradients against finite differences."""
 
-import inspect
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -105,35 +103,15 @@ def test_the_gradient_of_a_round_trip_through_a_matrix_is_the_identity(vector):
 
 
 @pytest.mark.parametrize(
-    ("name", "given", "message"),
+    ("name", "given", "parameter"),
     [
-        ("pose_from_matrix", (jnp.eye(3),), r"matrix has the shape \(3, 3\), but it must be \(..., 4, 4\)"),
-        ("quat_from_matrix", (jnp.eye(2),), r"matrix has the shape \(2, 2\), but it must be \(..., 3, 3\)"),
-        ("quat_from_rotvec", (jnp.zeros(4),), r"v has the shape \(4,\), but it must be \(..., 3\)"),
-        ("quat_canonical", (jnp.ones(3),), r"q has the shape \(3,\), but it must be \(..., 4\)"),
-        (
-            "transform",
-            (
-                jnp.zeros((2, 7)),
-                jnp.zeros(3),
-            ),
-            r"pose has the shape \(2, 7\), but .* jax\.vmap",
-        ),
-        (
-            "transform",
-            (
-                jnp.zeros(7),
-                [0, 0],
-            ),
-            r"points has the shape \(2,\), but it must be \(..., 3\)",
-        ),
-        ("pose_inverse", ("upright",), r"pose is 'upright', but it must be an array of numbers of shape \(..., 7\)"),
+        ("pose_from_matrix", (jnp.eye(3),), "matrix"),
+        ("quat_from_rotvec", (jnp.zeros(4),), "v"),
+        ("quat_canonical", (jnp.ones(3),), "q"),
+        ("transform", (jnp.zeros((2, 7)), jnp.zeros(3)), "pose"),
+        ("pose_inverse", ("upright",), "pose"),
     ],
 )
-def test_an_array_of_another_shape_raises_an_error(name, given, message):
-    with pytest.raises(ValueError, match=message):
-        inspect.unwrap(getattr(geometry, name))(*given)
-
-
-def test_lists_of_numbers_are_accepted():
-    np.testing.assert_allclose(inspect.unwrap(geometry.transform)([1, 2, 3, 0, 0, 0, 1], [1, 0, 0]), [0, 2, 3])
+def test_an_array_of_another_shape_raises_an_error(name, given, parameter):
+    with pytest.raises(TypeError, match=f"parameter '{parameter}'"):
+        getattr(geometry, name)(*given)

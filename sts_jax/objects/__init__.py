@@ -16,7 +16,7 @@ from sts_jax.objects.hulls import DIRECTIONS, lattice, rest_poses, support
 from sts_jax.objects.items import Entry, Item, Library
 from sts_jax.objects.libraries import HOLLOW, bodies, describe, facts, library, read, survey
 from sts_jax.objects.meshes import load
-from sts_jax.objects.parts import decompose, gaps, hull_gap
+from sts_jax.objects.parts import decompose, gaps
 from sts_jax.objects.procedural import Family, find_family, make
 
 __all__ = [
@@ -39,7 +39,6 @@ __all__ = [
     "fill_moments",
     "find_family",
     "gaps",
-    "hull_gap",
     "lattice",
     "library",
     "load",

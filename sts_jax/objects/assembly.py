@@ -1,4 +1,4 @@
-"""Assembly of a `Body` from a surface, its colours and its masses."""
+"""Assembly of a `Body` from a surface, its colours and its masses, in NumPy float64 on the host."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,12 +8,12 @@ from scipy.spatial import ConvexHull
 
 from sts_jax.objects.body import FACE_CLASSES, HULL_CLASSES, Body, pad, size_class
 from sts_jax.objects.hulls import convex_hull
-from sts_jax.objects.moments import PAIRS, solid_moments, surface_moments
 
 WALL = 1.2  # kg/m^2, default mass per area of the shell of a hollow object: plastic about 1.2 mm thick
 STEEL = 5.9  # kg/m^2 on each side of a sheet: 1.5 mm of stainless steel, 7,900 kg/m^3 (EN 10088-1, grade 1.4301)
 CONTENTS = 1000.0  # kg/m^3, density of the contents: water
 CREASE = np.deg2rad(40.0)  # rad, faces that meet at a larger angle do not share a corner normal
+PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # pairs of axes of the second moments, in the order of a row
 
 
 def assemble(
@@ -33,33 +33,20 @@ def assemble(
     """Assemble a `Body` from a surface, its colours and its masses.
 
     The body collides as the convex hull of the vertices, reduced to at most 64 vertices. The centroid of this hull
-    becomes the origin of the body's coordinates. The arrays are padded to a few allowed lengths, so that many bodies
-    have arrays of equal shapes. FACE_CLASSES lists these lengths for vertices and faces, and HULL_CLASSES for vertices
-    of the hull.
+    becomes the origin of the body's coordinates. The arrays are padded to size classes.
 
     Args:
-        vertices: Vertices of the surface (m), with +z up, at most 131,072.
-        faces: Vertex indices of each face, counter-clockwise seen from outside, at most 131,072 faces.
+        vertices: Vertices of the surface (m), with +z up.
+        faces: Vertex indices of each face, counter-clockwise seen from outside.
         colors: Colour of each corner of each face, in linear light, [0, 1]. `texture` is multiplied by this colour.
         density: Mass per area of each face (kg/m^2).
-        interior: Vertices and faces of a closed mesh around the contents, such as the water in a bottle, in the frame
-            of `vertices`. None for an object without contents.
+        interior: Vertices and faces of a closed mesh around the contents, in the frame of `vertices`, or None.
         contents_density: Density of the contents (kg/m^3).
-        mass: Mass of the object without contents (kg). The masses of all faces are multiplied by one factor, so that
-            their sum is `mass`. If `mass` is None, the mass of the object is computed from `density` and the areas of
-            the faces.
-        uv: Texture coordinates of each corner of each face, with v = 0 at the texture's top row. If `uv` is None, all
-            coordinates are 0.
-        texture: Square texture in linear light, [0, 1]. Its side is 1, 256 or 1024 pixels. If `texture` is None, the
-            texture is one white pixel.
+        mass: Mass of the object without contents (kg), to which the masses of all faces are scaled, or None.
+        uv: Texture coordinates of each corner of each face, with v = 0 at the texture's top row.
+        texture: Square texture in linear light, [0, 1]. Its side is one of TEXTURE_CLASSES. None is one white pixel.
         two_sided: True if faces are also visible from behind.
         category: Index into CATEGORIES, or -1 for an object of no category.
-
-    Returns:
-        The body.
-
-    Raises:
-        ValueError: The vertices lie in a plane, or `interior` encloses no volume.
     """
     hull = convex_hull(vertices)
     shape = ConvexHull(hull)
@@ -111,21 +98,10 @@ def assemble(
 def corner_normals(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], *, crease: float = CREASE
 ) -> Float[np.ndarray, "f 3 3"]:
-    """Compute the unit normal at each corner of each face, so that shading is smooth except at sharp edges.
-
-    For a corner of the face F at the vertex v, the result is the normalised weighted mean of the normals of faces that
-    meet at v. A face is included if the angle between its normal and the normal of F is less than `crease`. The weight
-    of a face is its interior angle at v. A face without area counts as a face with the normal (0, 0, 1) and the
-    weight 0.
-
-    Args:
-        vertices: Vertices of the surface (m).
-        faces: Vertex indices of each face. The surface is smooth only where faces share the index of a vertex.
-        crease: Smallest angle between the normals of two faces (rad) at which the edge between them is sharp. The
-            default is 40 degrees.
-
-    Returns:
-        Unit normal at each corner of each face.
+    """Unit normal at each corner of each face, so that shading is smooth except at sharp edges.
+     For a corner of the face F at the vertex v, the result is the normalised mean of the normals of faces that meet at
+    v, weighted by their interior angles at v. Only faces whose normal is within `crease` (rad) of F's normal count. A
+    face without area counts as one with the normal (0, 0, 1) and the weight 0.
     """
     triangles = vertices[faces]
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
@@ -150,3 +126,35 @@ def corner_normals(
     size = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.where(size > 1e-9, normals / np.where(size > 1e-9, size, 1), np.repeat(flat, 3, axis=0))
     return normals.reshape(-1, 3, 3)
+
+
+def solid_moments(triangles: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "f 10"]:
+    """Integrals of [1, x, y, z, xx, yy, zz, xy, xz, yz] over the tetrahedra between the origin and each triangle (m).
+
+    Their sum over a closed surface gives the integrals over the solid. With the corners a, b and c of a triangle,
+    counter-clockwise seen from outside, and s = a + b + c, the volume is v = a . (b x c) / 6, the first moments are
+    v s / 4, and the second moments v (s s^T + a a^T + b b^T + c c^T) / 20.
+    """
+    volume = np.einsum("fi,fi->f", triangles[:, 0], np.cross(triangles[:, 1], triangles[:, 2])) / 6
+    total = triangles.sum(axis=1)
+    second = (np.einsum("fi,fj->fij", total, total) + np.einsum("fki,fkj->fij", triangles, triangles)) / 20
+    return _rows(volume, total / 4, second)
+
+
+def surface_moments(triangles: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "f 10"]:
+    """Integrals of [1, x, y, z, xx, yy, zz, xy, xz, yz] over the area of each triangle (m).
+
+    With the corners r_i of a triangle, s = sum_i r_i and the area A, the first moments are A s / 3, and the second
+    moments A (s s^T + sum_i r_i r_i^T) / 12.
+    """
+    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    area = np.linalg.norm(cross, axis=1) / 2
+    total = triangles.sum(axis=1)
+    second = (np.einsum("fi,fj->fij", total, total) + np.einsum("fki,fkj->fij", triangles, triangles)) / 12
+    return _rows(area, total / 3, second)
+
+
+def _rows(measure: np.ndarray, mean: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Make rows of moments from the size, the mean and the mean square."""
+    columns = [np.ones_like(measure), *mean.T, *(second[:, i, j] for i, j in PAIRS)]
+    return measure[:, None] * np.stack(columns, axis=1)

@@ -30,11 +30,9 @@ CATEGORIES = ("bottle", "camera", "webcam", "mouse", "scissors", "fork", "spoon"
 @dataclasses.dataclass(frozen=True)
 class Body:
     """A rigid object in its own mesh frame, as a pytree whose leaves are all arrays.
-
-    The object is a shell, whose interior can be filled with contents such as water. `rigid` computes mass, centre of
-    mass and inertia of the shell with its contents. The origin lies inside the convex hull. The object usually stands
-    or lies with +z up. Each corner of a face has a colour. The albedo at a point of the face is the texture's value
-    times the colour that is interpolated between the corners (as in glTF), in linear light.
+     The object is a shell, whose interior can be filled with contents such as water (`rigid`). The origin lies inside
+    the convex hull. The object usually stands or lies with +z up. The albedo at a point of a face is the texture's
+    value times the colour that is interpolated between the corners (as in glTF), in linear light.
     """
 
     vertices: Float[Array, "*n v 3"]  # Vertices of the visible surface (m).
@@ -53,13 +51,9 @@ class Body:
     category: Int[Array, "*n"]  # Index into CATEGORIES, or -1 for an object of no category.
 
     def check(self) -> None:
-        """Check that the fields form a single body with finite values and valid indices.
+        """Raise a ValueError unless this is a single body with finite values and valid indices.
 
         The check needs concrete values, so it cannot run under `jit`.
-
-        Raises:
-            ValueError: The fields hold several stacked bodies, a value is not finite, a vertex index is out of range,
-                or the category is unknown. The message names the field.
         """
         if jnp.ndim(self.vertices) != 2:
             raise ValueError(
@@ -107,30 +101,18 @@ class Body:
 
 
 def size_class(count: int, classes: tuple[int, ...]) -> int:
-    """Return the number of rows to which an array of `count` rows is padded.
-
-    Args:
-        count: Number of rows of the array.
-        classes: Allowed numbers of rows in ascending order, such as `FACE_CLASSES`. The last number is at least
-            `count`.
-
-    Returns:
-        The smallest of the allowed numbers that is at least `count`.
-    """
+    """Return the smallest of the ascending `classes` that is at least `count`."""
     return next(size for size in classes if count <= size)
 
 
 def pad(array: np.ndarray, size: int, value: np.ndarray | float) -> np.ndarray:
-    """Append rows to an array until the array has `size` rows.
-
-    `value` is either the row to append, or a number for all elements of the appended rows.
-    """
+    """Append rows of `value`, a row or a number, until the array has `size` rows."""
     padding = np.broadcast_to(np.asarray(value, array.dtype), (size - len(array), *array.shape[1:]))
     return np.concatenate([array, padding])
 
 
 def check_category(category: object) -> None:
-    """Raise a ValueError unless a category is an index into `CATEGORIES`, or -1 for an object of no category."""
+    """Raise a ValueError unless a category is an index into `CATEGORIES`, or -1."""
     number = np.asarray(category)
     if number.shape or number.dtype.kind not in "iu" or not -1 <= number < len(CATEGORIES):
         raise ValueError(
@@ -140,7 +122,7 @@ def check_category(category: object) -> None:
 
 
 def is_traced(tree: object) -> bool:
-    """Return whether any leaf of a pytree is a JAX tracer instead of an array with concrete values."""
+    """Return whether any leaf of a pytree is a JAX tracer."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
@@ -149,19 +131,7 @@ def _form(leaf: object) -> str:
 
 
 def stack(bodies: Sequence[Body]) -> Body:
-    """Stack bodies into one `Body` with a leading axis, for `jax.vmap`.
-
-    Args:
-        bodies: At least one body. The arrays of all bodies must have the same shapes. Many bodies fulfil this, because
-            arrays are padded to the lengths in `FACE_CLASSES`, `PART_CLASSES` and `HULL_CLASSES`, and textures are
-            resized to the side lengths in `TEXTURE_CLASSES`.
-
-    Returns:
-        A body whose arrays are stacked along a new first axis.
-
-    Raises:
-        ValueError: There is no body, or the arrays of two bodies have different shapes.
-    """
+    """Stack bodies of one size class into one `Body` with a leading axis, for `jax.vmap`."""
     if not bodies:
         raise ValueError("bodies is empty, but stack needs at least one body")
     shapes = [[jnp.shape(leaf) for leaf in jax.tree.leaves(body)] for body in bodies]
@@ -200,7 +170,7 @@ def mirror(body: Body) -> Body:
 def rigid(
     body: Body, fill: ScalarLike, shell_scale: ScalarLike, up: Direction = (0.0, 0.0, 1.0)
 ) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3 3"]]:
-    """Compute mass, centre of mass and inertia of a body whose contents fill a share of its interior.
+    """Mass, centre of mass and inertia of a body whose contents fill a share of its interior.
 
     The shell has the mass m_s, the centre of mass c_s and the inertia I_s. The contents have the density rho, the
     volume V, the centre c_c and the second moments C = int (r - c_c) (r - c_c)^T dV. Let s be the factor `shell_scale`,
@@ -211,9 +181,8 @@ def rigid(
     Args:
         body: One body.
         fill: Share of the interior's volume that is filled from below, clipped to [0, 1].
-        shell_scale: Factor on the mass and the inertia of the shell. 1 keeps the values of `body`.
-        up: Unit vector in the mesh frame that pointed upwards while the contents settled. The surface of the contents
-            is perpendicular to it.
+        shell_scale: Factor on the mass and the inertia of the shell.
+        up: Unit vector in the mesh frame that pointed upwards while the contents settled.
 
     Returns:
         Mass (kg), centre of mass in the mesh frame (m), and inertia about the centre of mass along the mesh axes
@@ -250,23 +219,21 @@ class _Bracket(NamedTuple):
 def fill_moments(
     interior: Float[Array, "i 3 3"], fill: ScalarLike, up: Direction = (0.0, 0.0, 1.0)
 ) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3 3"]]:
-    """Compute volume, centre and second moments of the liquid that fills a share of a closed mesh from below.
+    """Volume, centre and second moments of the liquid that fills a share of a closed mesh from below.
 
     The triangles are clipped to the half-space below the liquid's surface. Each clipped triangle and a reference point
-    form a tetrahedron with a signed volume. The moments of the liquid are the sums over these tetrahedra. No triangles
-    cover the liquid's surface, so the tetrahedra between this surface and the reference point are missing from the
-    sums. The reference point lies on the liquid's surface, so that the missing tetrahedra have no volume. Bisection
-    finds the height of the liquid's surface.
+    form a tetrahedron with a signed volume, and the moments of the liquid are the sums over these tetrahedra. The
+    reference point lies on the liquid's surface, so that the triangles that would cover this surface add nothing.
+    Bisection finds the height of the surface.
 
     Args:
-        interior: Triangles of a closed surface (m), counter-clockwise seen from outside. Triangles without area have no
-            effect.
+        interior: Triangles of a closed surface (m), counter-clockwise seen from outside.
         fill: Share of the volume that is filled, clipped to [0, 1].
         up: Upward unit vector, perpendicular to the liquid's surface.
 
     Returns:
-        Volume (m^3), centre (m) and second moments about the centre (m^5) of the liquid. Without liquid, the centre is
-        the middle of the mesh's bounding box.
+        Volume (m^3), centre (m) and second moments about the centre (m^5). Without liquid, the centre is the middle of
+        the mesh's bounding box.
     """
     up = jnp.asarray(up, interior.dtype)
     height = interior @ up
@@ -274,7 +241,7 @@ def fill_moments(
     middle = (jnp.min(interior, axis=(0, 1)) + jnp.max(interior, axis=(0, 1))) / 2
 
     def below(level: Float[Array, ""]) -> _Liquid:
-        """Divide the interior below `level`, a height along `up` (m), into tetrahedra that share a corner."""
+        """Divide the interior below a height along `up` (m) into tetrahedra that share a corner."""
         # A triangle with one corner below the level adds the piece at that corner. A triangle with two corners below
         # adds the whole triangle and subtracts the piece at the corner above.
         reference = middle + (level - middle @ up) * up

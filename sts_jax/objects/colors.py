@@ -1,7 +1,4 @@
-"""Colours of procedural objects. Values are chosen in sRGB and returned in linear light, as arrays (3,) in [0, 1].
-
-`vivid`, `pale`, `dark` and `steel` draw a random colour from a generator of NumPy.
-"""
+"""Colours of procedural objects, chosen in sRGB and returned in linear light, as arrays (3,) in [0, 1]."""
 
 import numpy as np
 
@@ -10,38 +7,38 @@ Color = np.ndarray
 
 
 def linear(srgb: np.ndarray) -> np.ndarray:
-    """Convert sRGB values in [0, 1], of any shape, to linear light in [0, 1] (IEC 61966-2-1)."""
+    """Convert sRGB values in [0, 1] to linear light (IEC 61966-2-1)."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def hsv(hue: Number, saturation: Number, value: Number) -> Color:
-    """Convert a hue, a saturation and a value in sRGB, each in [0, 1], to a colour (3,) in linear light."""
+    """Colour of a hue, a saturation and a value in sRGB, each in [0, 1]."""
     wheel = np.clip(np.abs((hue * 6 + np.array([0.0, 4.0, 2.0])) % 6 - 3) - 1, 0, 1)
     return linear(value * (1 - saturation * (1 - wheel)))
 
 
 def grey(value: Number) -> Color:
-    """Return the grey of an sRGB value in [0, 1], as a colour (3,) in linear light."""
+    """Grey of an sRGB value in [0, 1]."""
     return linear(np.full(3, float(value)))
 
 
 def vivid(rng: np.random.Generator) -> Color:
-    """Return a random saturated and bright colour (3,) of any hue, in linear light."""
+    """Draw a saturated and bright colour of any hue."""
     return hsv(rng.uniform(), rng.uniform(0.65, 0.95), rng.uniform(0.6, 0.95))
 
 
 def pale(rng: np.random.Generator) -> Color:
-    """Return a random bright, nearly white colour (3,) of any hue, in linear light."""
+    """Draw a bright, nearly white colour of any hue."""
     return hsv(rng.uniform(), rng.uniform(0.0, 0.25), rng.uniform(0.8, 0.97))
 
 
 def dark(rng: np.random.Generator) -> Color:
-    """Return a random dark, nearly black colour (3,) of any hue, in linear light."""
+    """Draw a dark, nearly black colour of any hue."""
     return hsv(rng.uniform(), rng.uniform(0.0, 0.25), rng.uniform(0.12, 0.24))
 
 
 def steel(rng: np.random.Generator) -> Color:
-    """Return a random bluish grey (3,) that resembles steel, in linear light."""
+    """Draw a bluish grey that resembles steel."""
     return hsv(0.58, rng.uniform(0.0, 0.1), rng.uniform(0.58, 0.8))
 
 

@@ -28,22 +28,10 @@ DIRECTIONS = lattice(NUM_DIRECTIONS)  # (128, 3), unit vectors for which `suppor
 def convex_hull(
     points: Float[np.ndarray, "n 3"], *, limit: int = HULL_CLASSES[-1], tolerance: float = HULL_TOLERANCE
 ) -> Float[np.ndarray, "h 3"]:
-    """Compute an approximate convex hull of points, with a limited number of vertices.
+    """Vertices of an approximate convex hull of points.
 
     The hull starts as a tetrahedron of four points. Then the point farthest outside the hull is added
-    repeatedly, until no point is more than `tolerance` outside the hull, or until the hull has `limit` vertices.
-
-    Args:
-        points: Points that the hull encloses (m).
-        limit: Largest number of vertices, at least 4. The default is 64.
-        tolerance: Distance (m) by which points may lie outside the hull. If the hull has `limit` vertices, points may
-            lie farther outside. The default is 0.05 mm.
-
-    Returns:
-        Vertices of the hull. Each of them is one of the points.
-
-    Raises:
-        ValueError: The points lie in a plane.
+    repeatedly, until no point is more than `tolerance` (m) outside, or until the hull has `limit` vertices.
     """
     try:
         candidates = points[ConvexHull(points).vertices]
@@ -67,7 +55,7 @@ def convex_hull(
 
 
 def outside_hull(points: Float[np.ndarray, "n 3"], hull: Float[np.ndarray, "h 3"]) -> Float[np.ndarray, "n"]:
-    """Compute the distance (m) of each point from the convex hull of the vertices `hull`, 0 inside."""
+    """Distance (m) of each point from the convex hull of the vertices `hull`, 0 inside."""
     shape = ConvexHull(hull)
     normals, offsets = shape.equations[:, :3], shape.equations[:, 3]
     sides = points @ normals.T + offsets
@@ -86,20 +74,7 @@ def outside_hull(points: Float[np.ndarray, "n 3"], hull: Float[np.ndarray, "h 3"
 
 
 def support(body: Body) -> Float[np.ndarray, "128"]:
-    """Compute the support function of a body for the 128 unit vectors in DIRECTIONS.
-
-    For a direction d, the support function is the largest dot product v . d. The maximum is over the vertices v of the
-    convex parts that represent the body in collisions.
-
-    Args:
-        body: One body.
-
-    Returns:
-        Value for each direction (m), float32. Directions and vertices are in the mesh frame.
-
-    Raises:
-        ValueError: `body` holds several stacked bodies.
-    """
+    """Support function of a body: the largest v . d (m) over its collision vertices v, for each d in DIRECTIONS."""
     if np.ndim(body.hulls) != 3:
         raise ValueError(
             f"body.hulls has the shape {np.shape(body.hulls)}, but it must be (parts, vertices, 3): pass a single body"
@@ -121,10 +96,9 @@ def rest_poses(
         com: Centre of mass (m), in the same frame.
 
     Returns:
-        A unit vector and a share for each of the k faces on which the hull can rest. The unit vector is in the
-        frame of `points`. It points up when the hull rests on the face. The share is the solid angle of the face, seen
-        from the centre of mass, divided by the sum of the solid angles of these k faces. A larger share means that the
-        object is more likely to land on the face. Both arrays are empty if there is no such face.
+        For each of the k faces on which the hull can rest, the unit vector that then points up, in the frame of
+        `points`, and the solid angle of the face seen from the centre of mass, divided by the sum over the k faces. An
+        object is more likely to land on a face with a larger share.
     """
     hull = ConvexHull(points)
     normals, offsets = hull.equations[:, :3], hull.equations[:, 3]

@@ -1,12 +1,22 @@
-"""Dataclasses for a folder of mesh files: `Item` (one file), `Entry` (a loaded item) and `Library` (all items)."""
+"""A folder of mesh files: `Item` (one file), `Library` (all items), `Entry` (a loaded item), and a cache of bodies."""
 
 import dataclasses
+import hashlib
+import json
+import zipfile
 from pathlib import Path
+from typing import Any
 
-from sts_jax.objects.body import Body
+import jax.numpy as jnp
+import numpy as np
+
+from sts_jax.objects.body import FACE_CLASSES, HULL_CLASSES, PART_CLASSES, TEXTURE_CLASSES, Body
+from sts_jax.objects.materials import references
+from sts_jax.storage import write_arrays
 
 LARGEST = 0.12  # m, larger objects are scaled down to this longest side, so that they can lie on the pad of 0.15 m
 NUM_FACES = 4096  # the largest size class whose rendering is cheap
+_FORMAT = 1  # version of cached bodies, increased when the same file and settings lead to another body
 
 Vector = tuple[float, float, float]
 
@@ -50,3 +60,42 @@ class Entry:
     # Largest distances (m) of the surface outside the collision parts, and of the collision parts outside the surface.
     gaps: tuple[float, float]
     notes: tuple[str, ...]  # Repairs of the mesh and remarks on the item.
+
+
+def cache_path(library: Library, item: Item) -> Path:
+    """Path of an item's body in the cache: a hash of the mesh file, the files to which it refers, and all settings."""
+    assert library.cache is not None
+    digest = hashlib.sha256()
+    fields = [field.name for field in dataclasses.fields(Body)]
+    settings = [item.scale, item.longest_side, item.up, item.front, item.label, item.notes]
+    layout = [_FORMAT, fields, FACE_CLASSES, HULL_CLASSES, PART_CLASSES, TEXTURE_CLASSES]
+    digest.update(json.dumps([layout, settings, library.faces, library.largest, library.parts]).encode())
+    try:
+        named = references(item.path, item.textures)
+    except (OSError, ValueError):
+        named = {}  # `load` raises an error for the damaged file
+    if not item.path.is_file():
+        raise FileNotFoundError(
+            f"{item.path}: no such mesh file: restore it, or call objects.library() again to list the existing files"
+        )
+    for name, path in [(item.path.name, item.path), *sorted(named.items())]:
+        digest.update(name.encode() + b"\0" + (b"" if path is None else hashlib.sha256(path.read_bytes()).digest()))
+    return library.cache / f"{digest.hexdigest()[:32]}.npz"
+
+
+def write_cached(path: Path, entry: Entry) -> None:
+    """Write the body of an item to a file of the cache, atomically."""
+    about = json.dumps({"gaps": entry.gaps, "notes": entry.notes})
+    leaves: dict[str, Any] = {field.name: getattr(entry.body, field.name) for field in dataclasses.fields(Body)}
+    write_arrays(path, {"about": np.frombuffer(about.encode(), np.uint8), **leaves})
+
+
+def read_cached(path: Path, item: Item) -> Entry | None:
+    """Read the body of an item from a file of the cache. None if the file is missing or damaged."""
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
+            body = Body(**{field.name: jnp.asarray(data[field.name]) for field in dataclasses.fields(Body)})
+            about = json.loads(data["about"].tobytes())
+        return Entry(item, body, tuple(about["gaps"]), tuple(about["notes"]))
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None

@@ -1,12 +1,11 @@
 """Collections of mesh files: ShapeNetSem as downloaded, or any folder of meshes with one sub-folder per class.
 
-`library` lists the objects of a folder without opening a mesh. `read` loads one object, and `bodies` loads several.
-`survey` loads all objects once, fills the cache if there is one, and lists each object with its size or its error.
-`bodies` and `survey` continue after an object that cannot be loaded.
+`library` lists the objects of a folder without opening a mesh. `read` loads one object, `bodies` several. `survey`
+loads all objects once, fills the cache if there is one, and describes each object. `bodies` and `survey` continue after
+an object that cannot be loaded.
 """
 
 import dataclasses
-import math
 import os
 import warnings
 from collections import Counter
@@ -18,10 +17,20 @@ import numpy as np
 import trimesh
 from scipy.spatial import ConvexHull
 
-from sts_jax.objects import body_cache, shapenet
+from sts_jax.objects import shapenet
 from sts_jax.objects.assembly import STEEL, WALL
-from sts_jax.objects.body import CATEGORIES, PAD, SMALLEST, Body
-from sts_jax.objects.items import LARGEST, NUM_FACES, Entry, Item, Library
+from sts_jax.objects.body import CATEGORIES, Body
+from sts_jax.objects.checks import check_settings
+from sts_jax.objects.items import (
+    LARGEST,
+    NUM_FACES,
+    Entry,
+    Item,
+    Library,
+    cache_path,
+    read_cached,
+    write_cached,
+)
 from sts_jax.objects.meshes import AXES, load
 from sts_jax.objects.parts import decompose, gaps
 
@@ -47,55 +56,34 @@ def library(
     parts: bool = False,
 ) -> Library:
     """List the objects of a folder without opening a mesh.
-
-    If the folder or one of its direct sub-folders contains ShapeNetSem's table metadata.csv, the table lists the
-    objects. The table's column `unit` defines the size of an object. The columns `up` and `front` define the object's
-    orientation. The column `category` defines the object's class, which is one of CATEGORIES, such as "bottle". The
-    mesh of an object is expected at models-OBJ/models/ID.obj with the object's id as ID. The images for the mesh are
-    expected in models-textures/textures.
-
-    In any other folder, every mesh file is an object. The object's class is the name of the first sub-folder in the
-    path of the file. The class of a file directly in the folder is the name of the folder.
+     If the folder or one of its direct sub-folders contains ShapeNetSem's metadata.csv, this table lists the objects,
+    with their size (`unit`), orientation (`up`, `front`) and class (`category`), one of CATEGORIES. Meshes are expected
+    at models-OBJ/models/ID.obj, and images in models-textures/textures. In any other folder, every mesh file is an
+    object. Its class is the name of the first sub-folder in its path, or of the folder itself.
 
     Args:
         folder: Folder of the objects.
         cache: Folder for the loaded bodies, which is created if it is missing. None loads the mesh files each time.
-        scale: Length of one unit of the files (m), above 0. None uses ShapeNetSem's table, or 1 m without a table.
+        scale: Length of one unit of the files (m). None uses ShapeNetSem's table, or 1 m without a table.
         longest_side: Length to which the longest side of every object is scaled (m), from 5 mm to 0.15 m. None keeps
             the sizes. Must be None if `scale` is given.
         up: Axis of the files that becomes +z. None uses ShapeNetSem's table. Without a table, None is "y" for glTF and
             "z" for other formats.
         faces: Largest number of faces and of vertices, at least 4. Larger meshes are decimated, which needs the package
             fast-simplification.
-        largest: Upper limit for the longest side (m), from 5 mm to 0.15 m. Larger objects are scaled down to this
-            limit. Has no effect if `longest_side` is given.
+        largest: Upper limit for the longest side (m), from 5 mm to 0.15 m, to which larger objects are scaled down.
         parts: If True, objects whose convex hull reaches more than 2 mm outside the surface are decomposed into convex
             parts. This takes about ten seconds per object and needs the package coacd.
 
     Returns:
         The library. Its objects are sorted by class and name.
-
-    Raises:
-        FileNotFoundError: The folder does not exist.
-        ValueError: The folder contains no usable mesh, the table lacks columns or cannot be read, or an argument is out
-            of range.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder of objects: check the path")
-    if scale is not None and longest_side is not None:
-        raise ValueError(f"{folder}: give scale or longest_side, not both")
-    if scale is not None and not (scale > 0 and math.isfinite(scale)):
-        raise ValueError(
-            f"{folder}: scale, the length of one unit of the mesh files (m), must be positive and finite, got {scale}"
-        )
-    for name, value in (("longest_side", longest_side), ("largest", largest)):
-        if value is not None and not SMALLEST <= value <= PAD:
-            raise ValueError(f"{folder}: the argument {name} is {value} m, but it must be from {SMALLEST} to {PAD} m")
+    check_settings(folder, longest_side=longest_side, scale=scale, largest=largest, faces=faces)
     if up is not None and up not in AXES:
         raise ValueError(f"{folder}: up must be 'x', 'y' or 'z', got {up!r}")
-    if isinstance(faces, bool) or not isinstance(faces, int | np.integer) or faces < 4:
-        raise ValueError(f"{folder}: faces must be a whole number, at least 4, got {faces!r}")
     root = shapenet.find_root(folder)
     items, skipped = _walked(folder) if root is None else shapenet.items(root)
     if not items:
@@ -148,56 +136,39 @@ def _walked(folder: Path) -> tuple[list[Item], list[tuple[str, str]]]:
 
 def read(collection: Library, index: int) -> Entry:
     """Load one item as a body, through the cache if the library has one.
-
-    Scissors, forks and spoons are solid and of steel. All other objects are shells with contents. The body's category
-    is the index of its class in CATEGORIES, or -1 if CATEGORIES lacks the class. Warnings of `load`, such as those
-    about repairs of the mesh, are returned as notes instead.
-
-    Args:
-        collection: Library that the function `library` returned.
-        index: Index of the item in `collection.items`.
-
-    Returns:
-        The item, the body, its two `gaps`, and notes on repairs. The gaps are the largest distances (m) by which the
-        surface lies outside the collision parts, and by which the parts lie outside the surface.
-
-    Raises:
-        ImportError: A package for the decimation or the decomposition of the mesh is needed and not installed.
-        FileNotFoundError: The file no longer exists.
-        ValueError: The file cannot be loaded as a body. The message contains the reason.
+     Scissors, forks and spoons are solid and of steel. All other objects are shells with contents. Warnings of `load`,
+    such as those about repairs of the mesh, are returned as notes. Raises a ValueError with the reason if the file
+    cannot be loaded as a body.
     """
     item = collection.items[index]
     if collection.cache is None:
-        return _made(collection, item)
-    path = body_cache.path_of(collection, item)
-    entry = body_cache.read(path, item)
+        return _load(collection, item)
+    path = cache_path(collection, item)
+    entry = read_cached(path, item)
     if entry is None:
-        entry = _made(collection, item)
-        body_cache.write(path, entry)
+        entry = _load(collection, item)
+        write_cached(path, entry)
     return entry
 
 
 def bodies(collection: Library, indices: Iterable[int] | None = None) -> tuple[list[Body], list[tuple[str, str]]]:
-    """Load several items as bodies, and skip items that cannot be loaded.
+    """Load several items as bodies.
 
     Args:
         collection: Library that the function `library` returned.
         indices: Indices of the items in `collection.items`. None selects all items.
 
     Returns:
-        The bodies, and (name, reason) of each skipped item.
-
-    Raises:
-        ImportError: A package for the decimation or the decomposition of the mesh is needed and not installed.
+        The bodies, and (name, reason) of each item that cannot be loaded.
     """
-    made, skipped = [], []
+    loaded, skipped = [], []
     for index in range(len(collection.items)) if indices is None else indices:
-        entry = _tried(collection, index)
+        entry = _read_or_reason(collection, index)
         if isinstance(entry, str):
             skipped.append((collection.items[index].name, entry))
         else:
-            made.append(entry.body)
-    return made, skipped
+            loaded.append(entry.body)
+    return loaded, skipped
 
 
 def survey(collection: Library, *, progress: Callable[[str], None] | None = None) -> tuple[Library, str]:
@@ -205,18 +176,14 @@ def survey(collection: Library, *, progress: Callable[[str], None] | None = None
 
     Args:
         collection: Library that the function `library` returned.
-        progress: Function that is called after each item with the text line that describes the item. None for no calls.
+        progress: Function that is called after each item with the text line that describes the item.
 
     Returns:
-        The library and the listing. In the library, the items that cannot be loaded are moved to `skipped`. The listing
-        is a text with the number of objects of each class, a line for each object and a line for each skipped item.
-
-    Raises:
-        ImportError: A package for the decimation or the decomposition of a mesh is needed and not installed.
+        The library, with the items that cannot be loaded moved to `skipped`, and the listing.
     """
     items, skipped, lines = [], list(collection.skipped), []
     for index, item in enumerate(collection.items):
-        entry = _tried(collection, index)
+        entry = _read_or_reason(collection, index)
         if isinstance(entry, str):
             skipped.append((item.name, entry))
             line = f"{item.label}  {item.name}: left out: {entry}"
@@ -244,20 +211,14 @@ def survey(collection: Library, *, progress: Callable[[str], None] | None = None
 
 
 def describe(entry: Entry) -> str:
-    """Describe size, faces and collision parts of a loaded mesh file in one line of text, as `survey` does."""
+    """Describe a loaded mesh file in one line of text, as `survey` does."""
     return f"{entry.item.label}  {entry.item.name}: " + "; ".join([*facts(entry.body, entry.gaps), *entry.notes])
 
 
 def facts(body: Body, apart: tuple[float, float]) -> list[str]:
-    """Describe the size and the collision parts of a body in four short texts.
+    """Describe a body in four short texts: size (mm), number of faces, collision vertices, and `gaps` (mm).
 
-    Args:
-        body: One body.
-        apart: The two distances (m) from `gaps`. The first is the largest distance by which the surface lies outside
-            the collision parts. The second is the largest distance by which the parts lie outside the surface.
-
-    Returns:
-        Size along x, y and z (mm), number of faces, number of vertices of the collision parts, and both distances (mm).
+    `apart` are the two distances from `gaps` (m).
     """
     size = " x ".join(f"{side * 1e3:.0f}" for side in np.ptp(np.asarray(body.vertices), axis=0))
     drawn = int(np.asarray(body.faces).any(axis=1).sum())
@@ -267,7 +228,7 @@ def facts(body: Body, apart: tuple[float, float]) -> list[str]:
     return [size, f"{drawn} faces", hull, " / ".join(f"{gap * 1e3:.2f}" for gap in apart)]
 
 
-def _tried(collection: Library, index: int) -> Entry | str:
+def _read_or_reason(collection: Library, index: int) -> Entry | str:
     """Read an item, or return the reason why it cannot be loaded."""
     item = collection.items[index]
     try:
@@ -283,7 +244,7 @@ def _short(message: object, item: Item) -> str:
     return str(message).removeprefix(f"{item.path}: ").replace(f"{item.path.parent}{os.sep}", "").replace("\n", " ")
 
 
-def _made(collection: Library, item: Item) -> Entry:
+def _load(collection: Library, item: Item) -> Entry:
     """Load an item from its mesh file. Warnings become notes."""
     solid = item.label in _SOLID
     with warnings.catch_warnings(record=True) as caught:

@@ -16,16 +16,11 @@ PLAIN = 0.7  # sRGB grey of a mesh without colours
 
 
 def references(path: Path, images: Path | None = None) -> dict[str, Path | None]:
-    """Find the files to which an OBJ or glTF file refers, such as materials and images.
-
-    Args:
-        path: The mesh file.
-        images: Additional folder in which images are looked up, or None.
+    """Find the materials and images to which an OBJ file refers (`map_Kd`), or the files of a glTF.
 
     Returns:
-        Dictionary from the name of each file, as written in the mesh or material file, to its path. The path of a
-        missing file is None. For an OBJ file, the only images in the dictionary are the colour images (`map_Kd`). For
-        files other than `.obj` and `.gltf`, the dictionary is empty.
+        Dictionary from the name of each file, as written in the mesh or material file, to its path, or None if it is
+        missing. Images are also looked up in the folder `images`.
     """
     if path.suffix.lower() == ".gltf":
         tree = json.loads(path.read_text())
@@ -42,14 +37,7 @@ def references(path: Path, images: Path | None = None) -> dict[str, Path | None]
 def check_materials(path: Path, images: Path | None, strict: bool) -> None:
     """Check the materials and images of an OBJ, because trimesh silently ignores missing and damaged ones.
 
-    Args:
-        path: The mesh file. Files of other formats are not checked.
-        images: Additional folder in which images are looked up, or None.
-        strict: If True, a missing file is an error instead of a warning.
-
-    Raises:
-        FileNotFoundError: A file is missing and `strict` is True.
-        ValueError: An image cannot be read.
+    A missing file is a warning, or an error if `strict`. An image that cannot be read is an error.
     """
     if path.suffix.lower() != ".obj":
         return
@@ -72,12 +60,7 @@ def check_materials(path: Path, images: Path | None, strict: bool) -> None:
 
 
 def read_image(path: Path) -> Image.Image:
-    """Read an image file as RGB.
-
-    Raises:
-        FileNotFoundError: The file does not exist.
-        ValueError: The file cannot be read as an image.
-    """
+    """Read an image file as RGB."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such image file: check the path")
     try:
@@ -120,16 +103,9 @@ def _named(file: Path, word: str) -> list[str]:
 def albedo(path: Path, pieces: list[trimesh.Trimesh]) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Extract colours, texture coordinates and one common texture from all meshes of a file.
 
-    Args:
-        path: The mesh file. Colours of glTF files are in linear light. Colours of other files are in sRGB.
-        pieces: All meshes of the file.
-
     Returns:
         Colours (f, 3, 3) in linear light and texture coordinates (f, 3, 2) at the corners of all f faces, and a square
-        texture (t, t, 3) in linear light with a side of t pixels. The texture is None if no mesh has one.
-
-    Raises:
-        ValueError: A texture cannot be read.
+        texture in linear light, or None if no mesh has one.
     """
     is_linear = path.suffix.lower() in (".glb", ".gltf")
     colors, uvs, images = [], [], []
@@ -164,16 +140,7 @@ def albedo(path: Path, pieces: list[trimesh.Trimesh]) -> tuple[np.ndarray, np.nd
 
 
 def _packed(sheets: list[np.ndarray], uvs: list[np.ndarray], cells: list[int]) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Pack several textures into cells of one texture.
-
-    Args:
-        sheets: The textures.
-        uvs: Texture coordinates of each piece.
-        cells: Index of the texture of each piece.
-
-    Returns:
-        The packed texture, and the texture coordinates of each piece in it.
-    """
+    """Pack textures into cells of one texture. `cells` has the index of the texture of each piece."""
     # The packed texture has the size of a texture class, so that it is not resampled again.
     grid = int(np.ceil(np.sqrt(len(sheets))))
     size = _texture_class(grid * max(max(sheet.shape[:2]) for sheet in sheets))
@@ -202,7 +169,7 @@ def _square(sheet: np.ndarray, side: int) -> np.ndarray:
 
 
 def _piece_albedo(piece: trimesh.Trimesh, is_linear: bool) -> tuple[np.ndarray, np.ndarray, Image.Image | None]:
-    """Extract colours (f, 3, 3) in linear light, texture coordinates (f, 3, 2) and the image, if any, of one mesh."""
+    """Colours (f, 3, 3) in linear light, texture coordinates (f, 3, 2) and the image, if any, of one mesh."""
     faces = np.asarray(piece.faces)
     uv = np.zeros((len(faces), 3, 2))
     visual = piece.visual

@@ -16,30 +16,11 @@ from sts_jax.objects.surface import surface_samples
 _KEEP = "use the body without a decomposition, so that it collides as its convex hull"
 
 
-def convex_parts(
-    vertices: Float[np.ndarray, "v 3"],
-    faces: Int[np.ndarray, "f 3"],
-    *,
-    limit: int = PART_CLASSES[-1],
-    vertices_per_part: int = HULL_CLASSES[0],
-) -> list[Float[np.ndarray, "_ 3"]]:
-    """Decompose a surface into convex parts (CoACD: Wei et al., 2022, SIGGRAPH).
+def convex_parts(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> list[Float[np.ndarray, "_ 3"]]:
+    """Vertices (m) of the convex parts of a surface, the largest first (CoACD: Wei et al., 2022, SIGGRAPH).
 
     Equal meshes have equal parts, because the seed is fixed. CoACD first closes open surfaces, and thereby thickens
     them a little.
-
-    Args:
-        vertices: Vertices of the surface (m).
-        faces: Vertex indices of each face, counter-clockwise seen from outside.
-        limit: Largest number of parts. The default is 8.
-        vertices_per_part: Largest number of vertices of each part. The default is 32.
-
-    Returns:
-        Vertices of each part (m). Parts are sorted by volume, the largest first. A convex surface has a single part.
-
-    Raises:
-        ImportError: The package coacd is not installed.
-        ValueError: The surface cannot be decomposed.
     """
     try:
         import coacd
@@ -51,13 +32,13 @@ def convex_parts(
     try:
         pieces = coacd.run_coacd(
             coacd.Mesh(np.asarray(vertices, float), np.asarray(faces, np.int32)),
-            max_convex_hull=limit,
+            max_convex_hull=PART_CLASSES[-1],
             resolution=1000,
             mcts_nodes=10,
             mcts_iterations=40,
             seed=0,
         )
-        parts = [convex_hull(np.asarray(corners, float), limit=vertices_per_part) for corners, _ in pieces]
+        parts = [convex_hull(np.asarray(corners, float), limit=HULL_CLASSES[0]) for corners, _ in pieces]
     except (RuntimeError, ValueError) as error:
         raise ValueError(f"the surface cannot be decomposed into convex parts ({error}): {_KEEP}") from error
     if not parts:
@@ -66,20 +47,9 @@ def convex_parts(
 
 
 def decompose(body: Body) -> Body:
-    """Replace the collision hull of a body by several convex parts.
-
-    A shape that is not convex, such as scissors or a bowl, is approximated better by several parts than by one hull.
-
-    Args:
-        body: One body.
-
-    Returns:
-        The body with the parts in its field `hulls`, at most 8 parts of at most 32 vertices each. If a single part is
-        enough, the body is returned unchanged.
-
-    Raises:
-        ImportError: The package coacd is not installed.
-        ValueError: The surface cannot be decomposed.
+    """Replace the collision hull of a body by at most 8 convex parts of at most 32 vertices each.
+     A shape that is not convex, such as scissors or a bowl, is approximated better by several parts than by one hull.
+    If a single part is enough, the body is returned unchanged. This needs the package coacd.
     """
     parts = convex_parts(*_surface(body))
     if len(parts) == 1:
@@ -91,15 +61,7 @@ def decompose(body: Body) -> Body:
 
 
 def gaps(body: Body) -> tuple[float, float]:
-    """Compute the largest distances between the visible surface of a body and its collision parts.
-
-    Args:
-        body: One body.
-
-    Returns:
-        Largest distance (m) by which the surface lies outside the collision parts, and largest distance (m) by which
-        the collision parts lie outside the surface.
-    """
+    """Largest distances (m) between the visible surface of a body and its collision parts, see `surface_gaps`."""
     parts = np.asarray(body.hulls, float)
     new = np.array([True, *(parts[1:] != parts[:-1]).any(axis=(1, 2))])  # padding repeats the last part
     return surface_gaps(*_surface(body), [np.unique(part, axis=0) for part in parts[new]])
@@ -108,13 +70,10 @@ def gaps(body: Body) -> tuple[float, float]:
 def surface_gaps(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], hulls: Sequence[Float[np.ndarray, "_ 3"]]
 ) -> tuple[float, float]:
-    """Compute the largest distances between a visible surface and its collision parts.
+    """Largest distances between a visible surface and its collision parts.
 
-    The distances are computed at sample points. The sample points are the vertices of the surface and of the parts,
-    10,000 further points of the surface, and 10,000 further points of the parts. The distance of each sample point is
-    exact, but the true maximum can lie between the sample points. A returned value can therefore be too small by up to
-    about half the distance between neighbouring sample points. If there is only one part, the first returned value is
-    exact.
+    The distances are exact, at the vertices of the surface and of the parts and at 10,000 further points of each, so a
+    maximum between these points is missed. With only one part, the first value is exact.
 
     Args:
         vertices: Vertices of the visible surface (m).
@@ -122,11 +81,9 @@ def surface_gaps(
         hulls: Vertices of each convex part (m).
 
     Returns:
-        Largest distance (m) by which the surface lies outside all parts, and largest distance (m) by which the parts
-        lie outside the surface. The visible surface can sink into the pad by the first distance. A contact can lie
-        outside the visible surface by up to the second distance, such as in the hollow of a bowl. If the visible
-        surface is not closed, it has no outside. The second distance is then the largest distance from a point on the
-        surface of the parts to the visible surface.
+        Largest distance (m) by which the surface lies outside all parts and can sink into the pad, and largest distance
+        (m) by which the parts lie outside the surface, such as in the hollow of a bowl. A surface that is not closed
+        has no outside: the second value is then the largest distance from the parts to it.
     """
     points = np.concatenate([np.unique(vertices[faces].reshape(-1, 3), axis=0), _points(vertices[faces], 10_000)])
     shapes = [ConvexHull(hull) for hull in hulls]
@@ -138,17 +95,6 @@ def surface_gaps(
     points = np.unique(np.concatenate([triangles.reshape(-1, 3), _points(triangles, 10_000)]), axis=0)
     closed = bool(trimesh.Trimesh(vertices, faces, process=False).is_watertight)
     return float(out), _reach(points, vertices[faces], closed)
-
-
-def hull_gap(body: Body) -> float:
-    """Compute the largest distance (m) by which a vertex of a body's surface lies outside the body's collision parts.
-
-    If the body has one part, no point of the surface lies farther outside than the result. If the body has several
-    parts, points between the vertices can lie farther outside. Use `gaps` for such a body.
-    """
-    surface = np.unique(np.asarray(body.vertices, float), axis=0)
-    parts = [outside_hull(surface, np.unique(part, axis=0)) for part in np.asarray(body.hulls, float)]
-    return float(np.min(parts, axis=0).max())
 
 
 def _surface(body: Body) -> tuple[np.ndarray, np.ndarray]:

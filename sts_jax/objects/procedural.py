@@ -1,7 +1,7 @@
 """Procedural objects: the registry of families, and `make`, which generates an object of a family from a random key.
 
-A family is a class of objects, such as bottles. Each family has a module in `objects.families`. The module builds the
-parts of an object with `objects.shapes` and `objects.colors`, on the host and in millimetres.
+Each family has a module in `objects.families`, which builds the parts of an object with `objects.shapes` and
+`objects.colors`, on the host and in millimetres.
 """
 
 import dataclasses
@@ -24,16 +24,11 @@ class Family:
     """A class of procedural objects.
 
     Args:
-        name: Name of the class. The category of a body is the index of this name in CATEGORIES, or -1 if CATEGORIES
-            lacks the name.
-        seed: Whole number >= 0 that is combined with the key of `make`. Families with different seeds receive different
-            random numbers for the same key.
-        parts: Function that receives a `numpy.random.Generator`, draws the dimensions and colours of an object from it,
-            and returns the parts of the object in millimetres. +z points up in the usual pose of the object. Equal
-            generators must lead to equal parts. The object collides as the convex hull of all parts.
-
-    Raises:
-        ValueError: `seed` is not a whole number >= 0.
+        name: Name of the class. The category of a body is its index in CATEGORIES, or -1 if CATEGORIES lacks it.
+        seed: Whole number >= 0 that is combined with the key of `make`, so that families draw different numbers.
+        parts: Function that draws the dimensions and colours of an object from a `numpy.random.Generator` and returns
+            its parts in millimetres, with +z up in its usual pose. Equal generators must lead to equal parts. The
+            object collides as the convex hull of all parts.
     """
 
     name: str
@@ -62,17 +57,11 @@ FAMILIES = {
 
 
 def find_family(category: str) -> Family:
-    """Return the family that generates the objects of a category.
+    """Return the family of a category.
 
     Args:
         category: One of CATEGORIES, such as "bottle", or "module:NAME" for a `Family` of your own. The module is
             imported, and its variable NAME must hold the family. The module of a notebook or script is `__main__`.
-
-    Returns:
-        The family.
-
-    Raises:
-        ValueError: There is no such category, module or variable, or the variable does not hold a `Family`.
     """
     if category in FAMILIES:
         return FAMILIES[category]
@@ -103,20 +92,10 @@ def make(key: PRNGKeyArray, category: str | Family) -> Body:
 
     Args:
         key: Key from `jax.random.key`, consumed by the call.
-        category: A name in CATEGORIES (such as "bottle"), a `Family`, or a string "module:NAME" that names a
-            `Family` (see `find_family`).
+        category: A name in CATEGORIES, a `Family`, or "module:NAME" (see `find_family`).
 
     Returns:
-        A body whose +z axis points up in its usual pose. If the category is one of CATEGORIES, the longest side of the
-        body is 50 to 130 mm, and the arrays of its vertices and faces have 1,024 rows, including padding.
-
-    Raises:
-        TypeError: `key` is not a JAX key.
-        ValueError: `category` is unknown, or the family returns invalid parts. There must be at least one part. At most
-            one part may have `interior=True`, which marks the surface around the object's contents. This part must
-            enclose a volume. All vertices must be finite. All parts together may have at most 131,072 faces and at most
-            131,072 vertices. The parts must not all lie in one plane. The longest side of the object must be between
-            5 mm and 0.15 m.
+        A body whose +z axis points up in its usual pose. The longest side is 50 to 130 mm for the CATEGORIES.
     """
     check_key(key)
     family = find_family(category) if isinstance(category, str) else category

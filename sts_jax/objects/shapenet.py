@@ -34,11 +34,7 @@ _UP, _FRONT = (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)
 
 
 def find_root(folder: Path) -> Path | None:
-    """Find ShapeNetSem's table `metadata.csv` in a folder or its direct sub-folders.
-
-    Returns:
-        The folder that contains the table, or None if there is no table.
-    """
+    """Return the folder with ShapeNetSem's table `metadata.csv`, `folder` or a direct sub-folder, or None."""
     for table in (folder / "metadata.csv", *sorted(folder.glob("*/metadata.csv"))):
         if table.is_file():
             with table.open(encoding="utf-8", errors="replace", newline="") as lines:
@@ -49,17 +45,7 @@ def find_root(folder: Path) -> Path | None:
 
 
 def items(root: Path) -> tuple[list[Item], list[tuple[str, str]]]:
-    """List the models of ShapeNetSem that have a category in `CLASSES`, such as bottles and cameras.
-
-    Args:
-        root: Folder that contains ShapeNetSem's table `metadata.csv`.
-
-    Returns:
-        Mesh file and loading settings of each usable model, and (name, reason) of each skipped model.
-
-    Raises:
-        ValueError: The table lacks columns or cannot be read.
-    """
+    """List the models of ShapeNetSem that have a category in `CLASSES`, and (name, reason) of each skipped model."""
     rows = _rows(root / "metadata.csv")
     found: list[Item] = []
     skipped: list[tuple[str, str]] = []

@@ -1,8 +1,7 @@
 """Building blocks of procedural objects: outlines, surfaces through rings, and painted marks. Lengths are in mm.
 
 An outline is an array (n, 2) of points in a plane, counter-clockwise. Rings are an array (k, n, 3) of k outlines in
-space. `loft` builds a surface by connecting each ring to the next ring. A `Part` is such a surface with its colours. An
-object is a list of parts.
+space. `loft` connects each ring to the next one. Its result is a `Part`, and an object is a list of parts.
 """
 
 from collections.abc import Sequence
@@ -32,19 +31,15 @@ class Part(NamedTuple):
 
 
 def circle(radius: Number, num: int) -> np.ndarray:
-    """Return a circle with a radius (mm) about the origin, as an outline of `num` points, (num, 2)."""
+    """Circle about the origin, as an outline of `num` points."""
     angle = 2 * np.pi * (np.arange(num) + 0.5) / num
     return radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 def ellipse(a: Number, b: Number, num: int, power: Number = 2.0) -> np.ndarray:
-    """Return the superellipse |x / a|^power + |y / b|^power = 1, as an outline of `num` points, (num, 2).
+    """Superellipse |x / a|^power + |y / b|^power = 1, as an outline of `num` points.
 
-    Args:
-        a: Half of the width along x (mm).
-        b: Half of the width along y (mm).
-        num: Number of points.
-        power: Exponent. The outline is an ellipse for 2, and closer to a rectangle for larger values.
+    It is an ellipse for the power 2, and closer to a rectangle for larger powers.
     """
     angle = 2 * np.pi * (np.arange(num) + 0.5) / num
     c, s = np.cos(angle), np.sin(angle)
@@ -52,13 +47,7 @@ def ellipse(a: Number, b: Number, num: int, power: Number = 2.0) -> np.ndarray:
 
 
 def rectangle(width: Number, depth: Number, chamfer: Number = 0.0) -> np.ndarray:
-    """Return a rectangle about the origin, as an outline of 4 points, (4, 2), or of 8 points if corners are cut off.
-
-    Args:
-        width: Size along x (mm).
-        depth: Size along y (mm).
-        chamfer: Length by which each side is shortened at each corner (mm). 0 keeps the corners.
-    """
+    """Rectangle about the origin, as an outline of 4 points, or of 8 points if `chamfer` cuts off the corners."""
     w, d, c = width / 2, depth / 2, chamfer
     if c == 0:
         return np.array([[w, -d], [w, d], [-w, d], [-w, -d]])
@@ -71,29 +60,19 @@ def rectangle(width: Number, depth: Number, chamfer: Number = 0.0) -> np.ndarray
 
 
 def rings(outline: np.ndarray, levels: Sequence[tuple[Number, Number]]) -> np.ndarray:
-    """Return k rings, (k, n, 3) (mm). Each ring is a scaled copy of the outline in a horizontal plane.
-
-    Args:
-        outline: Outline of n points, (n, 2) (mm).
-        levels: Two numbers for each ring: the factor that scales the outline, and the height z of the ring (mm).
-    """
+    """Scaled copies of an outline in horizontal planes: `levels` has a factor and a height z for each ring."""
     return np.stack([np.column_stack([outline * scale, np.full(len(outline), z)]) for scale, z in levels])
 
 
 def sweep(path: np.ndarray, section: np.ndarray, binormal: Sequence[Number], *, closed: bool = False) -> np.ndarray:
-    """Return copies of an outline along a path, as rings for `loft`. They can form a tube or a handle.
+    """Copies of an outline along a path, as rings for `loft`. They can form a tube or a handle.
 
     Args:
-        path: Points along the path, (k, 3) (mm).
-        section: Outline of n points (mm), (n, 2), or one outline for each point of the path, (k, n, 2). The first
-            coordinate of an outline is along the cross product of the path's direction and `binormal`. The second
-            coordinate is along `binormal`.
+        path: Points along the path, (k, 3).
+        section: Outline (n, 2), or one for each point of the path, (k, n, 2). Its first coordinate is along the cross
+            product of the path's direction and `binormal`, the second along `binormal`.
         binormal: Unit vector (3,), not parallel to the path.
-        closed: True if the path continues from its last point to its first point. `path` must not repeat the first
-            point at its end.
-
-    Returns:
-        One ring for each point of the path, (k, n, 3) (mm).
+        closed: True if the path continues from its last point to its first point, which it must not repeat.
     """
     ahead = np.roll(path, -1, 0) - np.roll(path, 1, 0)
     if not closed:
@@ -122,13 +101,12 @@ def loft(
     """Build a surface by connecting rings. Its faces are counter-clockwise seen from outside.
 
     Args:
-        rings: k rings of n points each, (k, n, 3) (mm). A band of the surface connects each ring to the next one.
+        rings: k rings of n points each, (k, n, 3). A band of the surface connects each ring to the next one.
         color: One colour (3,) for the whole surface, one colour for each band, or n colours for each band, in linear
             light. There are k - 1 bands, or k bands if `closed` is True.
-        ends: Colours of the faces that close the first and the last ring. If one of the two colours is None, that end
-            is open. By default, both ends are closed. The end at the first ring then has the first colour of the first
-            band, and the end at the last ring has the last colour of the last band.
-        closed: True if a band also connects the last ring to the first. The surface then has no ends, as in a hoop.
+        ends: Colours of the faces that close the first and the last ring, or None for an open end. By default, they are
+            the first colour of the first band and the last colour of the last band.
+        closed: True if a band also connects the last ring to the first, as in a hoop.
         density: Mass per area (kg/m^2).
         interior: True if the surface bounds the contents of the object, such as the water in a bottle.
     """
@@ -171,12 +149,11 @@ def _volume(vertices: np.ndarray, faces: np.ndarray) -> float:
 
 
 def lathe(profile: Sequence[tuple[Number, Number]], color: Painted, *, num: int = 16, **kind: object) -> Part:
-    """Return a surface of revolution about the z axis.
+    """Surface of revolution about the z axis.
 
     Args:
-        profile: Points (radius, z) of the surface (mm). A band of the surface connects each point to the next one.
-        color: One colour (3,) for the whole surface, one colour for each band, or `num` colours for each band, in
-            linear light.
+        profile: Points (radius, z). A band of the surface connects each point to the next one.
+        color: One colour (3,), one for each band, or `num` colours for each band, in linear light.
         num: Number of points around the axis.
         kind: Keyword arguments of `loft`: `ends`, `closed`, `density` and `interior`.
     """
@@ -184,13 +161,7 @@ def lathe(profile: Sequence[tuple[Number, Number]], color: Painted, *, num: int 
 
 
 def box(size: Sequence[Number], centre: Sequence[Number], color: Color) -> Part:
-    """Return a box of one colour, with edges parallel to the axes.
-
-    Args:
-        size: Size along x, y and z (mm).
-        centre: Centre (x, y, z) (mm).
-        color: Colour (3,) in linear light.
-    """
+    """Box of one colour, with edges parallel to the axes."""
     x, y, z = size
     return move(loft(rings(rectangle(x, y), [(1.0, -z / 2), (1.0, z / 2)]), color), centre)
 
@@ -198,16 +169,9 @@ def box(size: Sequence[Number], centre: Sequence[Number], color: Color) -> Part:
 def decal(
     outline: np.ndarray, color: Color, shift: Sequence[Number] = (0, 0, 0), *, axis: str = "z", spin: Number = 0.0
 ) -> Part:
-    """Return a painted mark without mass.
+    """Painted mark without mass that faces +z, 0.04 mm above z = 0, and is then placed as in `move`.
 
-    The mark faces +z and lies 0.04 mm above the plane z = 0. It is then rotated and shifted as in `move`.
-
-    Args:
-        outline: Outline of the mark, (n, 2) (mm). Each point must be visible from the mean of all points.
-        color: Colour (3,) in linear light.
-        shift: Shift along x, y and z (mm).
-        axis: Direction to which the mark's z axis is turned before the shift: "x", "y", "z", "-x", "-y" or "-z".
-        spin: Rotation about z (rad), applied before `axis`.
+    Each point of the outline must be visible from the mean of all points.
     """
     n = len(outline)
     points = np.column_stack([np.vstack([outline, outline.mean(axis=0)]), np.full(n + 1, PAINT)])
@@ -229,32 +193,28 @@ _TURNS = {
 
 
 def rotation_about_z(angle: Number) -> np.ndarray:
-    """Return the rotation matrix (3, 3) of an angle (rad) about the z axis."""
+    """Rotation matrix (3, 3) of an angle (rad) about the z axis."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
 
 def move(part: Part, shift: Sequence[Number] = (0, 0, 0), *, axis: str = "z", spin: Number = 0.0) -> Part:
-    """Rotate a part about z, then turn its z axis to another direction, then shift it.
+    """Rotate a part about z by `spin` (rad), then turn its z axis to `axis`, then shift it.
 
-    Args:
-        part: Part to move.
-        shift: Shift along x, y and z (mm).
-        axis: Direction to which the part's z axis is turned before the shift: "x", "y", "z", "-x", "-y" or "-z".
-        spin: Rotation about z (rad), applied before `axis`.
+    `axis` is "x", "y", "z", "-x", "-y" or "-z".
     """
     return part._replace(vertices=part.vertices @ (_TURNS[axis] @ rotation_about_z(spin)).T + np.asarray(shift, float))
 
 
 def mirrored(part: Part, axis: int = 0) -> Part:
-    """Mirror a part: change the sign of the coordinate `axis` (0, 1 or 2) of every vertex."""
+    """Mirror a part: change the sign of the coordinate `axis` of every vertex."""
     flip = np.ones(3)
     flip[axis] = -1
     return part._replace(vertices=part.vertices * flip, faces=part.faces[:, ::-1])
 
 
 def scaled(parts: list[Part], longest: Number) -> list[Part]:
-    """Scale all parts of an object so that the longest side of their common bounding box is `longest` (mm)."""
+    """Scale all parts of an object so that the longest side of their common bounding box is `longest`."""
     points = np.concatenate([part.vertices for part in parts])
     scale = longest / np.ptp(points, axis=0).max()
     return [part._replace(vertices=part.vertices * scale) for part in parts]

@@ -1,9 +1,8 @@
-"""The pinhole camera below the gel, and the part of its view that an image shows.
+"""The pinhole camera below the gel, and the window of its view that an image shows.
 
 A window is the rectangle `(left, top, width, height)` in metres on the gel's outer face (z = 0) that an image shows. In
-the image, x points to the right and y points down. `left` is therefore the smallest x of the window, and `top` is its
-smallest y. The optical axis is perpendicular to the gel's outer face. The cost of an image depends on its number of
-pixels and not on the window.
+the image, x points to the right and y points down, so `left` and `top` are the smallest x and y. The optical axis is
+perpendicular to the gel's outer face. The cost of an image depends on its number of pixels and not on the window.
 """
 
 import dataclasses
@@ -34,17 +33,7 @@ class Camera:
 
 
 def full_window(camera: Camera, resolution: tuple[int, int]) -> Float[Array, "4"]:
-    """Compute the largest centred window in the camera's view that has the aspect ratio of an image.
-
-    A window is the rectangle on the gel's outer face that an image shows.
-
-    Args:
-        camera: The camera.
-        resolution: Height and width of the image (pixels).
-
-    Returns:
-        Left edge (smallest x), top edge (smallest y), width along x and height along y of the window (m).
-    """
+    """Largest centred window (m) in the view that has the aspect ratio of an image of (height, width) pixels."""
     ratio = resolution[1] / resolution[0]
     height = 2 * camera.distance * jnp.tan(jnp.asarray(camera.fov) / 2)
     width = jnp.minimum(height * camera.aspect, height * ratio)
@@ -55,24 +44,16 @@ def full_window(camera: Camera, resolution: tuple[int, int]) -> Float[Array, "4"
 def object_window(
     camera: Camera, points: Float[Array, "v 3"], resolution: tuple[int, int], *, smallest: float = 0.005
 ) -> Float[Array, "4"]:
-    """Compute a window around an object.
-
-    Source: the supplement of Rezaei-Shoshtari et al. 2021, "Training Details".
-
-    A window is the rectangle on the gel's outer face that an image shows. The full window (`full_window`) is the
-    largest centred window in the camera's view that has the aspect ratio of the image. The points are projected to the
-    gel's outer face. If their bounding box does not overlap the full window, the result is the full window. Otherwise,
-    the box is clipped to the full window. The result is then the smallest window that contains the clipped box, has the
-    aspect ratio of the image, lies within the full window and has a shorter side of at least `smallest`.
+    """Window (m) around an object (supplement of Rezaei-Shoshtari et al. 2021, "Training Details").
+     The smallest window that contains the bounding box of the points, projected to the gel's outer face and clipped to
+    the full window (`full_window`), has the aspect ratio of the image, lies within the full window and has a shorter
+    side of at least `smallest` (m). If no point is in view, it is the full window.
 
     Args:
         camera: The camera.
         points: Points of the object in the sensor frame (m). Points nearer than `Camera.near` are ignored.
         resolution: Height and width of the image (pixels).
-        smallest: Smallest allowed length of the window's shorter side (m).
-
-    Returns:
-        Left edge (smallest x), top edge (smallest y), width along x and height along y of the window (m).
+        smallest: Smallest length of the window's shorter side (m).
     """
     full = full_window(camera, resolution)
     lower, size = full[:2], full[2:]
@@ -96,15 +77,13 @@ def to_pixels(
 
     Args:
         camera: The camera.
-        window: Rectangle that the image shows on the gel's outer face (z = 0, on which objects lie): x of the left
-            edge, y of the top edge (the smallest y), width, height (m), in the sensor frame.
+        window: Window of the image (m).
         shape: Height and width of the image (pixels).
         points: Points in the sensor frame (m).
 
     Returns:
-        Columns and rows of the points (pixels), and depths of the points along the optical axis from the pinhole (m).
-        The column and the row are whole numbers at the centre of a pixel. A point nearer than `Camera.near` is
-        projected as if its depth were `Camera.near`, but its true depth is returned.
+        Columns and rows (pixels), whole numbers at pixel centres, and depths along the optical axis (m). A point nearer
+        than `Camera.near` is projected as if its depth were `Camera.near`, but its true depth is returned.
     """
     depth = points[:, 2] + camera.distance
     on_face = camera.distance * points[:, :2] / jnp.maximum(depth, camera.near)[:, None]
@@ -115,16 +94,9 @@ def to_pixels(
 def rays(
     camera: Camera, window: Float[Array, "4"], shape: tuple[int, int]
 ) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
-    """Compute the slopes x / depth and y / depth of the camera rays through the pixel centres.
+    """Slopes x / depth and y / depth of the camera rays through the pixel centres of an image.
 
-    Args:
-        camera: The camera.
-        window: Rectangle that the image shows on the gel's outer face: left, top, width, height (m).
-        shape: Height and width of the image (pixels).
-
-    Returns:
-        Slopes in x and in y. The point at depth D on a ray with the slopes (a, b) is (D a, D b, D - camera.distance) in
-        the sensor frame.
+    The point at depth D on a ray with the slopes (a, b) is (D a, D b, D - camera.distance) in the sensor frame.
     """
     x = (window[0] + (jnp.arange(shape[1]) + 0.5) / shape[1] * window[2]) / camera.distance
     y = (window[1] + (jnp.arange(shape[0]) + 0.5) / shape[0] * window[3]) / camera.distance

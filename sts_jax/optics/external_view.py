@@ -25,9 +25,7 @@ def photograph(
     resolution: tuple[int, int] = (200, 200),
     two_sided: Bool[Array, ""] | bool = False,
 ) -> Float[Array, "h w 3"]:
-    """Draw triangles as seen from any viewpoint, in daylight and lamplight.
-
-    The background is white. The z axis points up.
+    """Draw triangles as seen from any viewpoint, in daylight and lamplight, before a white background. +z is up.
 
     Args:
         vertices: Vertices in the world frame (m).

@@ -1,7 +1,6 @@
 """Shading of the view through the skin: the lit object, its shadow on the skin, and the haze of the translucent gel.
 
-Light is linear RGB, unless stated otherwise. As the last step of rendering, `to_srgb` converts the image to sRGB. In
-the shapes of arguments, `*n` stands for any number of leading axes.
+Light is linear RGB, unless stated otherwise. As the last step of rendering, `to_srgb` converts the image to sRGB.
 """
 
 import dataclasses
@@ -22,7 +21,7 @@ Scalar = float | Array
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Room:
-    """Constants of the external light on the object, and of the gel and skin through which the camera sees the object.
+    """External light on the object, and the gel and skin through which the camera sees the object.
 
     The skin is a translucent paint. Colours are linear RGB, unless stated otherwise. Values for which no reference is
     cited are our choice.
@@ -86,14 +85,9 @@ def to_srgb(linear: Float[Array, "*n"]) -> Float[Array, "*n"]:
 
 
 def sample_texture(texture: Float[Array, "t t 3"], uv: Float[Array, "*n 2"]) -> Float[Array, "*n 3"]:
-    """Look up values in a texture by bilinear interpolation. The texture repeats beyond its borders.
+    """Look up values in a square texture by bilinear interpolation. It repeats beyond its borders.
 
-    Args:
-        texture: Square texture of any values.
-        uv: Texture coordinates. u from 0 to 1 runs from the left to the right edge, and v from the top to the bottom.
-
-    Returns:
-        Values at the coordinates.
+    u from 0 to 1 runs from the left to the right edge, and v from the top to the bottom.
     """
     size = texture.shape[0]
     if size == 1:
@@ -109,37 +103,31 @@ def hidden_sky(
     x: Float[Array, "w"],
     y: Float[Array, "h"],
 ) -> Float[Array, "h w"]:
-    """Compute the share of the sky that an object hides from points on the skin, which is the paint on the gel's face.
-
-    Parts of the sky are weighted by the cosine of their angle to the vertical. The object is approximated by horizontal
-    slices at a few heights z, from its lowest to its highest point. Each slice has the outline of the object as seen
-    from above. Within the outline, the slice at z is opaque where the underside of the object is below z, and
-    transparent where the underside is above 2 z. In between, the opacity decreases linearly from 1 to 0.
-
-    The share of the sky that a half-plane at the height z hides from a point is `f(d) = (1 - d / sqrt(d^2 + z^2)) / 2`.
-    Here d is the horizontal distance from the point to the edge of the half-plane, and d is negative if the half-plane
-    extends over the point. A strip between two parallel lines is the difference of two half-planes, and it hides the
-    difference of their shares. The shares are computed on a grid of about 30 x 30 cells. The share that one cell of a
-    slice hides is approximated by the share of the strip over its row times the share of the strip over its column.
-    The sum over all cells of a slice is therefore a product of three matrices:
+    """Share of the sky that an object hides from points on the skin, weighted by the cosine to the vertical.
+     The object is approximated by horizontal slices at a few heights z, from its lowest to its highest point. Within
+    the outline of the object seen from above, the slice at z is opaque where the underside is below z, and transparent
+    where it is above 2 z. In between, the opacity decreases linearly.
+     The share of the sky that a half-plane at the height z hides from a point is `f(d) = (1 - d / sqrt(d^2 + z^2)) /
+    2`. Here d is the horizontal distance from the point to the edge of the half-plane, and d is negative if the
+    half-plane extends over the point. A strip hides the difference of the shares of two half-planes. On a grid of about
+    30 x 30 cells, the share that one cell of a slice hides is approximated by the share of the strip over its row times
+    the share of the strip over its column, so
 
         hidden = max_z Y_z slice_z X_z^T
-
-    slice_z is the opacity of the slice in each cell, times the fraction of the cell's area that is inside the outline.
-    X_z[i, j] is the share of the sky that a strip over column j at the height z hides from the centre of column i. Y_z
-    is the same matrix for rows instead of columns. The maximum over the slices is taken in each cell. Quadratic splines
-    interpolate between the cells.
+     slice_z is the opacity of the slice in each cell, times the fraction of the cell inside the outline. X_z[i, j] is
+    the share that a strip over column j at the height z hides from the centre of column i, and Y_z likewise for rows.
+    Quadratic splines interpolate between the cells.
 
     Args:
-        heights: Heights of the object's underside above the gel's face (m), on a uniform grid of r rows and c columns
-            over the pad, `inf` where there is no object. Row 0 has the smallest y, and column 0 has the smallest x.
-        size: Width along x and height along y of the pad (m). The pad is centred on the sensor's z axis.
+        heights: Heights of the object's underside above the gel's face (m), on a uniform grid over the pad, `inf` where
+            there is no object. Row 0 has the smallest y, and column 0 has the smallest x.
+        size: Width along x and height along y of the pad (m), centred on the sensor's z axis.
         top: Height of the object's highest point (m).
-        x: x coordinate of each column of a grid of points on the skin (m).
-        y: y coordinate of each row of this grid (m).
+        x: x of each column of a grid of points on the skin (m).
+        y: y of each row of this grid (m).
 
     Returns:
-        Shares from 0 to 1 at the points of the grid. Points outside the pad have the share of the nearest point inside.
+        Shares in [0, 1]. Points outside the pad have the share of the nearest point inside.
     """
     blocks = [max(1, round(cells / _SKY_CELLS)) for cells in heights.shape]
     padding = [(0, -cells % block) for cells, block in zip(heights.shape, blocks, strict=True)]
@@ -194,23 +182,17 @@ def housing(
     size: tuple[Scalar, Scalar],
     distance: Scalar,
 ) -> Float[Array, "*n"]:
-    """Compute the brightness of the sensor's housing, which the camera sees beside the pad.
+    """Brightness of the sensor's housing, which the camera sees beside the pad, relative to the pad (sRGB ratio).
 
-    The housing has a dark wall at each edge of the pad. Each wall is perpendicular to the gel's outer face and extends
-    towards the camera. A camera ray that passes beside the pad ends at a wall. The brightness of a wall decreases with
-    the distance t from the plane of the gel's outer face: `rim exp(-t / rim_depth)`. `rim` and `rim_depth` (m) are
-    fields of the argument `room`.
+    A dark wall extends from each edge of the pad towards the camera. At the depth t below the gel's outer face, its
+    brightness is `rim exp(-t / rim_depth)`, with the fields of `room`.
 
     Args:
         room: Constants of the external light.
-        on_pad: True for rays that pass through the pad.
+        on_pad: True for rays that pass through the pad, where the result is 1.
         places: x and y at which the rays cross the plane of the gel's outer face (m).
         size: Width along x and height along y of the pad (m).
         distance: Distance from the pinhole to the plane of the gel's outer face (m).
-
-    Returns:
-        Brightness for each ray, as an sRGB value divided by the sRGB value of the pad. It is 1 on the pad, and at most
-        `rim` on the walls.
     """
     beyond = jnp.maximum(2 * jnp.abs(places[..., 0]) / size[0], 2 * jnp.abs(places[..., 1]) / size[1])
     below = distance * (1 - 1 / jnp.maximum(beyond, 1))
@@ -220,18 +202,13 @@ def housing(
 def empty_view(
     room: Room, square_radius: Float[Array, "*n"], walls: Float[Array, "*n"], hidden: Float[Array, "*n"]
 ) -> Float[Array, "*n 3"]:
-    """Render the pad and the housing's walls with the shadow of the object, but without the object itself.
+    """Linear light of the pad and the housing's walls with the shadow of the object, but without the object.
 
     Args:
         room: Constants of the external light.
-        square_radius: Squared distance from the pad's centre on the gel's face, `(2 x / width)^2 + (2 y / height)^2`
-            with the width and height of the pad. It is 1 at the middle of each edge.
-        walls: Brightness of the housing's walls relative to the pad, from `housing`, as a ratio of sRGB values.
-            `empty_view` squares the ratio to approximate the ratio of linear light.
-        hidden: Share of the sky that the object hides, from `hidden_sky`. Zeros give the view of the empty sensor.
-
-    Returns:
-        Linear RGB light.
+        square_radius: `(2 x / width)^2 + (2 y / height)^2` on the pad, 1 at the middle of each edge.
+        walls: Brightness from `housing`, a ratio of sRGB values. Its square approximates the ratio of linear light.
+        hidden: Share of the sky that the object hides, from `hidden_sky`.
     """
     light = (1 - room.vignette * square_radius) * walls * walls * (1 - room.milk * hidden)
     return jnp.maximum(light, 0)[..., None] * jnp.broadcast_to(to_linear(room.background), (*light.shape, 3))
@@ -245,13 +222,10 @@ def shade(
     empty: Float[Array, "*n 3"],
     hidden: Float[Array, "*n"],
 ) -> Float[Array, "*n 3"]:
-    """Compute the colour of an object as seen through the skin.
-
-    The colour is computed in four steps. `ambient`, `crease`, `crease_height`, `haze`, `tint` and `milk` are fields of
-    the argument `room`.
-
-    1. Light on the object by Lambert's law: `albedo * (ambient + sum_m max(0, L_m . N) c_m)`, with the normal N, and
-       the unit direction L_m and colour c_m of each light m.
+    """Linear light of an object as seen through the skin.
+     1. Lambert's law: `albedo * (ambient + sum_m max(0, L_m . N) c_m)`, with the normal N, and the unit direction L_m
+    and
+       colour c_m of each light m.
     2. Contact shade: the share `crease * hidden * exp(-height / crease_height)` of this light is lost.
     3. Haze: the share `t = exp(-height / haze)` of the remaining light is transmitted and multiplied by `tint`. The
        share `1 - t` of the background `empty` is added.
@@ -265,9 +239,6 @@ def shade(
         heights: Heights of the object's points above the gel's outer face (m). Negative heights count as 0.
         empty: Background at the same pixels, with the object's shadow, from `empty_view`.
         hidden: Share of the sky that the object hides from the skin at the same pixels, from `hidden_sky`.
-
-    Returns:
-        Linear RGB light.
     """
     # Channel by channel, because XLA on a CPU is slow along an axis of three.
     directions, colors = geometry.normalize(room.directions), room.colors

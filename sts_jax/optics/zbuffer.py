@@ -6,9 +6,9 @@ covered pixels and not with the product of faces and pixels. Each step is one sc
 depth in the high bits and the index of the face in the low bits. The choice of the face has no gradient. Values that
 are interpolated on the chosen face have gradients.
 
-Pixel coordinates are (column, row). The coordinates of a pixel's centre are whole numbers. Columns increase to the
-right and rows downwards. The order of a point is a number that is smaller for nearer points and affine across a face on
-the screen. It is -1 / depth in the view of a pinhole, and depth in a parallel projection.
+Pixel coordinates are (column, row), whole numbers at pixel centres, with columns to the right and rows downwards. The
+order of a point is smaller for nearer points and affine across a face on the screen: -1 / depth in the view of a
+pinhole, and depth in a parallel projection.
 """
 
 import math
@@ -41,7 +41,6 @@ class _Screen(NamedTuple):
     two_sided: Bool[Array, ""]  # True if faces are also visible from behind
 
     def corners(self, chosen: Int[Array, "n"]) -> tuple[_Corner, _Corner, _Corner]:
-        """Return the three corners of the chosen faces."""
         a, b, c = ((self.column[k], self.row[k], self.order[k]) for k in self.faces[chosen].T)
         return a, b, c
 
@@ -91,23 +90,19 @@ def rasterise(
     """Find the nearest face at every pixel centre.
 
     Args:
-        points: Columns and rows of the vertices on the screen (pixels). The centre of each pixel has whole-number
-            coordinates.
-        order: Number for each vertex, smaller for nearer vertices. It must be a linear function of column and row on
-            each face, such as -1 / depth for a pinhole, or depth for a parallel projection.
-        faces: Vertex indices of each face, counter-clockwise as seen from outside the object in a right-handed frame.
-            Faces that only pad the array, with three equal corners, cost almost nothing.
-        keep: Mask of the vertices that may be drawn. A face is drawn only if the mask is True for all its corners.
+        points: Columns and rows of the vertices on the screen (pixels).
+        order: Order of each vertex.
+        faces: Vertex indices, counter-clockwise as seen from outside the object in a right-handed frame. Padding faces,
+            with three equal corners, cost almost nothing.
+        keep: Mask of the vertices. A face is drawn only if the mask is True for all its corners.
         two_sided: If True, faces are also visible from behind.
         shape: Height and width of the image (pixels).
-        within: Limit in units of `order`, or None. If given, the result also has an image of only the near faces. A
-            face is near if the order of at least one of its corners is below the limit.
-        chunk: Number of runs that are drawn at a time. A run is a part of one row of a face, up to 8 pixels long.
+        within: Limit in units of `order`, or None. A face is near if one of its corners has a smaller order.
+        chunk: Number of runs that are drawn at a time.
 
     Returns:
-        Index of the nearest face at each pixel, -1 where no face is visible. The shape is (h, w), the height and width
-        of the image. If `within` is given, the shape is (2, h, w): the image of the near faces, then the image of all
-        faces. The indices have no gradient.
+        Index of the nearest face at each pixel, -1 where no face is visible. With `within`, the shape is (2, h, w): the
+        image of only the near faces, then the image of all faces.
     """
     points, order, within = jax.lax.stop_gradient((points, order, within))
     screen = _Screen(points[:, 0], points[:, 1], order, keep, faces, two_sided)
@@ -212,7 +207,7 @@ def _draw(
 def _spans(
     screen: _Screen, runs: _Runs, canvas: _Canvas, shape: tuple[int, int], within: ScalarLike | None, chunk: int
 ) -> tuple[_Spans, Int[Array, ""]]:
-    """Return the runs of the next chunk, and the place in the list of the face with which the chunk after it begins."""
+    """Return the runs of the next chunk, and the place in the list of the face with which the following one begins."""
     height, width = shape
     run = canvas.next_run + jnp.arange(chunk, dtype=jnp.int32)
     # Every listed face has a run, so at most `chunk` faces begin in this chunk: the next ones of the list.
@@ -244,10 +239,9 @@ def _spans(
 def _row_ends(
     corners: tuple[_Corner, _Corner, _Corner], area: Float[Array, "r"], row: Float[Array, "r"]
 ) -> tuple[Float[Array, "r"], Float[Array, "r"]]:
-    """Columns at which a row of a face starts and stops.
+    """Columns at which a row of a face starts and stops, from its left edges to its right edges.
 
-    A row extends from the left edges of the face to its right edges, and not beyond its corners. A face that is nearly
-    a horizontal line covers its row from its leftmost to its rightmost corner.
+    A face that is nearly a horizontal line covers its row from its leftmost to its rightmost corner.
     """
     a, b, c = corners
     top, bottom = _lowest(a[1], b[1], c[1]), _highest(a[1], b[1], c[1])
@@ -269,16 +263,16 @@ def barycentrics(
     column: Float[Array, "*n"],
     row: Float[Array, "*n"],
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"], Float[Array, "*n"]]:
-    """Compute the barycentric weights of points on the screen. Each point has a face of its own.
+    """Barycentric weights of points on the screen, each in a face of its own.
 
     Args:
-        corners: Columns and rows of the first, second and third corner of each point's face, as three pairs (pixels).
+        corners: Columns and rows of the three corners of each point's face, as three pairs (pixels).
         column: Columns of the points (pixels).
         row: Rows of the points (pixels).
 
     Returns:
-        Weights of the three corners. They sum to 1 and are >= 0, even if rounding puts a point outside its face. A face
-        without area has the weights (1, 0, 0).
+        Three weights >= 0 that sum to 1, even if rounding puts a point outside its face. A face without area has the
+        weights (1, 0, 0).
     """
     # Relative to the point, because on thin faces absolute coordinates cause errors of several per cent in float32.
     a, b, c = ((x - column, y - row) for x, y in corners)
@@ -291,7 +285,7 @@ def barycentrics(
 
 
 def pixel_centres(shape: tuple[int, ...]) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
-    """Return the column and the row of each pixel of an image with the shape (height, width)."""
+    """Column and row of each pixel of an image with the shape (height, width)."""
     row, column = jnp.meshgrid(*(jnp.arange(n, dtype=jnp.float32) for n in shape), indexing="ij")
     return column, row
 

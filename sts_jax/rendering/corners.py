@@ -11,10 +11,7 @@ from sts_jax import optics
 
 
 class Corners(NamedTuple):
-    """Faces of an object, with the positions of their vertices in a camera image or in the gel's grid.
-
-    The gel's grid is a regular grid of cells on the pad, in which the heights of the object above the gel are computed.
-    """
+    """Faces of an object, with the positions of their vertices in a camera image or in the gel's grid."""
 
     column: Float[Array, "v"]  # columns of the vertices (pixels)
     row: Float[Array, "v"]  # rows of the vertices (pixels)
@@ -26,16 +23,8 @@ def weights(
     corners: Corners, winner: Int[Array, "h w"], column: Float[Array, "h w"], row: Float[Array, "h w"]
 ) -> tuple[list[Int[Array, "h w"]], tuple[Float[Array, "h w"], ...]]:
     """Vertex indices and barycentric weights of the three corners of the face that is visible at each pixel.
-
-    Args:
-        corners: Vertices and faces of the object.
-        winner: Index of the visible face at each pixel. A negative index, for a pixel without a face, gives the corners
-            of face 0.
-        column: Column of each pixel.
-        row: Row of each pixel.
-
-    Returns:
-        Vertex indices of the first, second and third corner, and the weights of these corners.
+     `winner` is the index of the visible face. A negative index, for a pixel without a face, gives the corners of face
+    0.
     """
     of_face = corners.faces[jnp.maximum(winner, 0)]
     indices = [of_face[..., k] for k in range(3)]
@@ -45,11 +34,7 @@ def weights(
 def weighted(
     corners: Corners, winner: Int[Array, "h w"], column: Float[Array, "h w"], row: Float[Array, "h w"]
 ) -> list[Float[Array, "h w"]]:
-    """For each pixel, multiply `corners.value` at the three corners of the visible face by barycentric weights.
-
-    The result is a list of the three products. Their sum is the interpolated value at the pixel. The function `weights`
-    describes the arguments.
-    """
+    """Products of `corners.value` and the weights at the three corners, which sum to the interpolated value."""
     indices, shares = weights(corners, winner, column, row)
     return [share * corners.value[k] for share, k in zip(shares, indices, strict=True)]
 
@@ -57,14 +42,8 @@ def weighted(
 def interpolated(
     corners: Corners, images: tuple[Int[Array, "h w"], Float[Array, "h w"], Float[Array, "h w"]]
 ) -> Float[Array, "h w"]:
-    """For each pixel, interpolate `corners.value` between the three corners of the visible face.
+    """Interpolated `corners.value` at each pixel, meaningless at pixels without a face.
 
-    Args:
-        corners: Vertices and faces of the object, with the value at each vertex.
-        images: Three arrays: the index of the visible face at each pixel, the column of each pixel, and the row of each
-            pixel. They are the arguments `winner`, `column` and `row` of the function `weights`.
-
-    Returns:
-        Interpolated value at each pixel, meaningless at pixels without a face.
+    `images` are the arguments `winner`, `column` and `row` of `weights`.
     """
     return functools.reduce(operator.add, weighted(corners, *images))

@@ -1,7 +1,6 @@
 """The second of the two compiled programs of `sense`: it draws the visual, tactile and depth images of an object.
 
-The first program (`rendering.equilibrium`) computes the pose in which the object and the gel are in balance. The second
-program is compiled again for each new resolution.
+It is compiled again for each new resolution.
 """
 
 import functools
@@ -24,7 +23,7 @@ from sts_jax.sensor import Sensor
 
 
 class Images(NamedTuple):
-    """Visual, tactile and depth image of one frame, the mask of the object, and the part of the gel that they show."""
+    """Images of one moment, and the part of the gel that they show."""
 
     visual: Float[Array, "h w 3"]  # view through the skin, sRGB in [0, 1]
     tactile: Float[Array, "h w 3"]  # image of the lit skin in [0, 1]
@@ -63,23 +62,14 @@ class _Surface(NamedTuple):
 def draw(
     sensor: Sensor, body: Body, resting: Resting, *, resolution: tuple[int, int], crop: bool, moving_edges: bool
 ) -> Images:
-    """Draw the images of an object whose pose on the gel is known.
-
-    `sense` runs two compiled programs. The first program (`rendering.equilibrium`) computes the object's pose on the
-    gel and the pressure of the gel. This function is the second program. Its argument `resting` is the result of the
-    first program. Its other arguments are those of `sense`.
-    """
+    """Draw the images of an object in the pose that `rendering.equilibrium` found. See `sense`."""
     drawn = functools.partial(_draw, resolution=resolution, crop=crop, moving_edges=moving_edges)
     return looped(drawn)(sensor, body, resting)
 
 
 @jax.jit
 def touch(sensor: Sensor, imprint: Float[Array, "h w"], window: Float[Array, "4"]) -> Float[Array, "h w 3"]:
-    """Draw the tactile image of an imprint. `sts_jax.touch` has the details.
-
-    `imprint` contains depths (m). `window` is the part of the gel's face that the image shows: left, top, width,
-    height (m).
-    """
+    """Draw the tactile image of an imprint (m) in a window (m). See `sts_jax.touch`."""
     rows, columns = imprint.shape
     pitch = window[2:] / jnp.array([columns, rows], jnp.float32)
     seen = jnp.concatenate([window[:2] - pitch, window[2:] + 2 * pitch])
@@ -147,7 +137,7 @@ def _sample(
 def _see(
     sensor: Sensor, body: Body, resting: Resting, samples: _Samples
 ) -> tuple[Float[Array, "a b"], list[Float[Array, "a b"]]]:
-    """Compute the depth (m), and the three channels of the view through the skin in linear light."""
+    """Depth (m), and the three channels of the view through the skin in linear light."""
     size, winner, (x, y) = sensor.gel.size, samples.winner, samples.places
     hidden = optics.hidden_sky(resting.heights, size, _cpu_reductions.maximum(resting.points[:, 2]), x[0], y[:, 0])
     square_radius = (x * 2 / size[0]) ** 2 + (y * 2 / size[1]) ** 2
@@ -169,7 +159,7 @@ def _see(
 
 
 def _shade(surface: _Surface, images: tuple[Array, ...]) -> list[Float[Array, "h w"]]:
-    """Compute the depth of the object (m), and the three channels of its colour through the skin in linear light."""
+    """Depth of the object (m), and the three channels of its colour through the skin in linear light."""
     winner, on_pad, column, row, slope_x, slope_y, hidden, *empty = images
     nearest = jnp.maximum(winner, 0)
     shares = weighted(surface.corners, winner, column, row)

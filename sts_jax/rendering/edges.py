@@ -26,27 +26,21 @@ def with_moving_edges(
     The derivative here is
 
         d imprint = rate - v . grad imprint
-
-    Each pixel shows one point of the object. v is the motion of this point in the image (pixels), and `rate` is the
+     Each pixel shows one point of the object. v is the motion of this point in the image (pixels), and `rate` is the
     change of the point's depth below the undeformed surface of the gel (m). The second term is a sum over pairs of
     neighbouring pixels. For each pair, the difference of the imprint's depths at the two pixels is multiplied by the
-    component of v along the line from one pixel to the other. This component is taken at the pixel at which the object
-    is nearer to the camera. Half of this product is subtracted from the derivative at each of the two pixels. The pairs
-    are the micro-edges of Pidhorskyi et al. 2024, "Rasterized Edge Gradients". The derivative is accurate on average
-    over a few pixels.
+    component of v along the line from one pixel to the other, taken at the pixel at which the object is nearer to the
+    camera. Half of this product is subtracted from the derivative at each of the two pixels. The pairs are the
+    micro-edges of Pidhorskyi et al. 2024, "Rasterized Edge Gradients". The derivative is accurate on average over a few
+    pixels.
 
     Args:
         imprint: Depth of the imprint below the undeformed surface of the gel (m).
         corners: Faces of the object, and for each vertex its position in the image and 1 / depth (1/m).
-        images: Three images (h, w): the index of the visible face at each pixel, the column of each pixel, and the row
-            of each pixel.
+        images: Index of the visible face at each pixel, column and row of each pixel.
         depth: Depth of the object from the pinhole (m), `inf` where there is no object.
         on_pad: True for pixels whose rays pass through the pad.
-        follows: True for pixels in which the imprint follows the surface of the object. False where the object does not
-            press into the gel, and where the imprint is clipped to the thickness of the gel.
-
-    Returns:
-        The imprint.
+        follows: True where the imprint follows the surface of the object: it presses, and the imprint is not clipped.
     """
     return imprint
 

@@ -1,4 +1,4 @@
-"""The first compiled program of `sense`: it lets an object sink and tilt until the gel and the object are in balance.
+"""The first of the two compiled programs of `sense`: an object sinks and tilts until the gel balances the wrench.
 
 The program does not depend on the resolution of the images.
 """
@@ -16,7 +16,7 @@ from sts_jax.rendering.tiles import lines, where_active
 
 
 class Resting(NamedTuple):
-    """An object in balance on the gel: its vertices, its pose, the heights of its underside, and the pressure."""
+    """An object in balance on the gel."""
 
     points: Float[Array, "v 3"]  # vertices in the sensor frame (m)
     pose: Float[Array, "7"]  # pose in balance, or a pose below the pad if an input is invalid
@@ -37,19 +37,9 @@ def _balance(
     pose: Float[Array, "7"],
     wrench: Float[Array, "6"] | None,
 ) -> Resting:
-    """Let an object sink and tilt until the gel balances the wrench.
+    """Let an object sink and tilt until the gel balances the wrench. None keeps the object in the given pose.
 
-    Args:
-        gel: Constants of the gel.
-        sound: False for an invalid sensor or body. The object is then placed below the pad, where it is not drawn.
-        vertices: Vertices in the mesh frame (m).
-        faces: Vertex indices of the faces.
-        two_sided: True if faces are also visible from behind.
-        pose: Pose before the object sinks, mesh frame in the sensor frame: position (m) and quaternion.
-        wrench: Force (N) and moment (N m) of the pad on the object. None keeps the object in the given pose.
-
-    Returns:
-        The object in balance.
+    If `sound` is False (an invalid sensor or body), the object is placed below the pad, where it is not drawn.
     """
     length = geometry.norm(jnp.where(jnp.isfinite(pose), pose, 0)[3:])
     finite = sound & jnp.all(jnp.isfinite(pose)) & (length > 0) & jnp.isfinite(length)
@@ -91,19 +81,18 @@ def underside(
     points: Float[Array, "v 3"],
     present: Bool[Array, ""],
 ) -> tuple[Float[Array, "r c"], Float[Array, "r c"]]:
-    """Heights of an object's underside above the gel's face, on the gel's grid of r rows and c columns.
+    """Heights of an object's underside above the gel's face (m), on the gel's grid, `inf` at cells without a face.
 
     Args:
         gel: Constants of the gel.
         faces: Vertex indices of the object's faces.
         two_sided: True if faces are also visible from behind.
         points: Vertices in the sensor frame (m).
-        present: If False, the object is ignored, and both height maps are `inf` everywhere.
+        present: If False, the object is ignored.
 
     Returns:
-        Two height maps (m). The first map contains only those faces of the object that are low enough to press on the
-        gel. The second map contains all faces of the object, because each of them blocks light that falls on the
-        gel from above. Each map is `inf` at cells where the map contains no face.
+        The map of only those faces that are low enough to press on the gel, and the map of all faces, because each of
+        them hides a part of the sky.
     """
     rows, columns = gel.cells
     across, down, height = (points[:, k] for k in range(3))
@@ -122,7 +111,6 @@ def underside(
 
 
 def _moved(pose: Float[Array, "7"], contact: tactile.Equilibrium) -> Float[Array, "7"]:
-    """Pose of an object after it has rotated and sunk into the gel."""
     turn = geometry.quat_from_rotvec(jnp.concatenate([contact.turn, jnp.zeros(1)]))
     drop = jnp.stack([jnp.float32(0), jnp.float32(0), -contact.sink])
     position = geometry.transform(jnp.concatenate([drop, turn]), pose[:3])

@@ -18,19 +18,17 @@ def lit_skin(
     pitch: Float[Array, "2"],
     slopes: tuple[Float[Array, "1 b"], Float[Array, "a 1"]],
 ) -> list[Float[Array, "h w"]]:
-    """Compute the brightness of the gel's skin under the lights inside the sensor, for a grid of camera rays.
+    """Brightness of the gel's skin under the lights inside the sensor, for a grid of camera rays.
 
     Args:
         sensor: Constants of the sensor.
-        imprint: Depth of the imprint below the gel's face (m), for the ray at each row and column of the grid.
+        imprint: Depth of the imprint below the gel's face (m), for each ray.
         window: Part of the gel's face that the grid covers: left, top, width, height (m).
         pitch: Distance between rays along x and y on the gel's face (m).
-        slopes: Slopes of the rays: x / depth at each column, and y / depth at each row. Here, depth is the distance
-            from the pinhole along the camera's axis.
+        slopes: x / depth at each column, and y / depth at each row.
 
     Returns:
-        Red, green and blue channel, not clipped to [0, 1]. Each channel has two rows and two columns less than
-        `imprint`, because the normal at a ray is computed from the neighbouring rays.
+        Red, green and blue channel, not clipped, without the outermost rows and columns, which have no normals.
     """
     coupled = sensor.skin.coupling > 0
     imprint = jax.lax.cond(coupled, tactile.couple, lambda *given: given[0], imprint, sensor.skin.coupling, pitch)
@@ -45,7 +43,7 @@ def lit_skin(
 
 
 def _skin(sensor: Sensor, images: tuple[Array, ...]) -> list[Float[Array, "h w *tiles"]]:
-    """Compute the brightness of pressed skin.
+    """Brightness of pressed skin.
 
     `images` are the slopes of the rays in x and y, the imprint (m) and the share of each light, with one more pixel on
     each side than the result.

@@ -24,12 +24,7 @@ Flat = Callable[..., list[Array]]
 def looped(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function that `jax.vmap` runs item by item on a CPU, and for all items at once on other devices.
 
-    Args:
-        function: Function from pytrees of arrays to a pytree of arrays. It must receive all traced values as
-            arguments, and not close over any.
-
-    Returns:
-        Function with the same values and derivatives.
+    The function maps pytrees of arrays to a pytree of arrays. It must not close over traced values.
     """
 
     def with_trees(*arguments: Any) -> Any:
@@ -118,7 +113,6 @@ _linear.multiple_results = True
 
 
 def _apply(*operands: ArrayLike, function: Flat, active: tuple[bool, ...], transposed: bool) -> list[Array]:
-    """Evaluate the primitive."""
     arguments, vectors = operands[: len(active)], operands[len(active) :]
 
     def of_active(*moving: Array) -> list[Array]:
@@ -132,7 +126,6 @@ def _apply(*operands: ArrayLike, function: Flat, active: tuple[bool, ...], trans
 
 
 def _abstract(*operands: Any, **params: Any) -> list[Any]:
-    """Shapes and types of the primitive's results."""
     shapes = jax.eval_shape(functools.partial(_apply, **params), *operands)
     return [jax.core.ShapedArray(leaf.shape, leaf.dtype) for leaf in shapes]
 
@@ -158,7 +151,6 @@ def _derivative(
 
 
 def _transpose(cotangents: Sequence[Any], *operands: Any, transposed: bool, **params: Any) -> list[Any]:
-    """Transpose of the primitive with respect to its tangents or cotangents."""
     first = len(params["active"])
     vectors = [ad.instantiate_zeros(cotangent) for cotangent in cotangents]
     back = _linear.bind(*operands[:first], *vectors, transposed=not transposed, **params)

@@ -1,11 +1,9 @@
 """Evaluation of an image function on those tiles of an image that have active pixels.
 
-An active pixel is a pixel at which the function must be evaluated, such as a pixel that shows the object. In most
-images of a sensor, few pixels are active. `where_active` cuts the image into square tiles and evaluates the tiles with
-an active pixel, batch by batch. The cost depends on the number of these tiles and not on the size of the image. In
-three cases, the function is instead called once with the whole image: if more than 40 % of the tiles have an active
-pixel (`CROWDED`), if the image is smaller than a tile, or if `where_active` runs under `vmap`. The gradient is always
-computed on the whole image.
+In most images of a sensor, few pixels are active, such as those that show the object. `where_active` cuts the image
+into square tiles and evaluates the tiles with an active pixel, batch by batch. The function is instead called once with
+the whole image if more than 40 % of the tiles are active (`CROWDED`), if the image is smaller than a tile, or under
+`vmap`. The gradient is always computed on the whole image.
 """
 
 import functools
@@ -29,26 +27,17 @@ Function = Callable[[Any, Images], Images]
 def where_active(
     function: Function, active: Bool[Array, "h w"], params: Any, images: Images, otherwise: Images, *, ring: int = 0
 ) -> Images:
-    """Evaluate a function of images only on those tiles (squares of 4 x 4 pixels) that have an active pixel.
-
-    The result is `jnp.where(active, function(params, images), otherwise)`. Derivatives are those of this expression
-    over the whole image.
+    """`jnp.where(active, function(params, images), otherwise)`, with the function evaluated only on active tiles.
 
     Args:
-        function: Function `(params, images) -> result`. For any a and b, it must map a pytree of images (a + 2 * ring,
-            b + 2 * ring) to a pytree of images (a, b). A pixel of the result must depend only on pixels at most `ring`
-            rows and columns away. `function` may receive a batch of tiles as images of shape (a + 2 * ring, b + 2 *
-            ring, number of tiles). It must then return images of shape (a, b, number of tiles). `function` must not
-            close over traced values. Pass traced values in `params`.
+        function: Function `(params, images) -> result` from images (a + 2 * ring, b + 2 * ring) to images (a, b), for
+            any a and b. A pixel of the result must depend only on pixels at most `ring` rows and columns away. Images
+            may have a third axis, of tiles. It must not close over traced values: pass them in `params`.
         active: Mask of the pixels at which the result is needed.
         params: First argument of `function`.
         images: Pytree of images (h + 2 * ring, w + 2 * ring). An image with a single row or column is broadcast.
-        otherwise: Pytree of images (h, w) with the result at pixels that are not active. Its structure must be the
-            structure that `function` returns.
+        otherwise: Pytree of images (h, w), of the structure that `function` returns.
         ring: Number of neighbouring pixels in each direction that `function` needs.
-
-    Returns:
-        Pytree of images (h, w).
     """
     if min(active.shape) < TILE:
         return _dense(function, active, params, images, otherwise)
@@ -56,10 +45,7 @@ def where_active(
 
 
 def lines(images: tuple[Float[Array, "a b"], Float[Array, "a b"]]) -> tuple[Float[Array, "1 b"], Float[Array, "a 1"]]:
-    """Return the first row of an image of x values, and the first column of an image of y values.
-
-    All rows of the first image must be equal. All columns of the second image must be equal.
-    """
+    """First row of an image of x values whose rows are equal, and first column of an image of y values likewise."""
     return images[0][:1], images[1][:, :1]
 
 
@@ -69,7 +55,6 @@ def planes(image: Float[Array, "h w *n 3"]) -> list[Float[Array, "h w *n"]]:
 
 
 def _dense(function: Function, active: Bool[Array, "h w"], params: Any, images: Images, otherwise: Images) -> Images:
-    """Evaluate the function on the whole image."""
     shape = jnp.broadcast_shapes(*(image.shape for image in jax.tree.leaves(images)))
     values = function(params, jax.tree.map(lambda image: jnp.broadcast_to(image, shape), images))
     return jax.tree.map(lambda value, other: jnp.where(active, value, other), values, otherwise)

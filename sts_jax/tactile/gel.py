@@ -1,11 +1,7 @@
-"""Model of the gel as a bed of independent springs, and the equilibrium of an object on the gel.
+"""The gel as a bed of independent springs, and the equilibrium of an object on it.
 
-In equilibrium, the pressure of the springs produces the force Fz and the moments Mx and My of the wrench that the pad
-exerts on the object.
-
-An object is given by the heights of its underside above the gel's undeformed face (m), one height for each cell of the
-gel's grid. Heights are negative where the object presses into the gel. Row 0 has the smallest y, and column 0 has the
-smallest x.
+An object is given by the heights of its underside above the gel's undeformed face (m), one for each cell of the gel's
+grid, negative where the object presses into the gel. Row 0 has the smallest y, and column 0 the smallest x.
 """
 
 import dataclasses
@@ -56,10 +52,7 @@ class Gel:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Equilibrium:
-    """Equilibrium of a rigid object on the gel: the motion of the object and the pressure on the gel.
-
-    The object moves from its given pose to the equilibrium. `sink` and `turn` describe this motion.
-    """
+    """Motion of a rigid object from its given pose to the equilibrium on the gel, and the pressure on the gel."""
 
     # Motion along -z (m), which follows the rotation.
     sink: Float[Array, "*n"]
@@ -86,17 +79,9 @@ def cell_area(gel: Gel) -> Float[Array, ""]:
 
 
 def indent(gel: Gel, heights: Float[Array, "r c"]) -> Equilibrium:
-    """Compute the pressure on the gel under an object that stays in its given pose.
+    """Pressure under an object that stays in its given pose: `p = k min(max(0, -h), t)`.
 
-    The pressure is `p = k min(max(0, -h), t)`, with the stiffness k and the thickness t of the gel, and the heights h.
-
-    Args:
-        gel: Constants of the gel.
-        heights: Heights of the object's underside above the gel's face (m), `inf` where there is no object.
-
-    Returns:
-        The `Equilibrium`, with `sink` and `turn` equal to 0. `balanced` is always True,
-        because there is no load that the pressure would have to balance.
+    k is the stiffness of the gel, t its thickness, and h the heights, `inf` where there is no object.
     """
     pressure = gel.stiffness * jnp.clip(-heights, 0, gel.thickness)
     return Equilibrium(jnp.float32(0), jnp.zeros(2), pressure, jnp.bool_(True))
@@ -104,11 +89,9 @@ def indent(gel: Gel, heights: Float[Array, "r c"]) -> Equilibrium:
 
 def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) -> Equilibrium:
     """Find the depth and the tilts of an object at which the pressure of the gel produces the given Fz, Mx and My.
-
-    The gel is a grid of cells, and each cell is an independent spring. Let h be the height of the object above the cell
-    whose centre has the coordinates x and y. The object sinks by d. It also turns by a small angle a about the x axis,
-    and by a small angle b about the y axis. Let k be the stiffness of the gel. Above the cell, the object then has the
-    height h' and exerts the pressure p:
+     Each cell of the gel is a spring. The object sinks by d, and turns by a small angle a about the x axis and b about
+    the y axis. Above the cell with the centre (x, y), it then has the height h' and exerts the pressure p, with the
+    stiffness k:
 
         h' = h - d + a y - b x,   p = k max(0, -h')
 
@@ -132,11 +115,10 @@ def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) ->
             due to friction and are ignored.
 
     Returns:
-        The equilibrium. If `Fz <= 0`, there is no motion and no pressure, and `balanced` is True. If no equilibrium
-        exists within the limits of depth (`Gel.max_depth`) and tilt (`Gel.max_tilt`), the result lies within these
-        limits and `balanced` is False. This happens if the object's lowest point is too far above the gel's face in
-        the given pose (by more than `Gel.max_depth`), if the centre of pressure of the wrench lies outside the object's
-        footprint or outside the pad, or if the load needs more depth or tilt than the limits allow.
+        The equilibrium. If `Fz <= 0`, there is no motion and no pressure, and `balanced` is True. `balanced` is False
+        if no equilibrium exists within the limits of depth and tilt: the object starts more than `Gel.max_depth` above
+        the face, the centre of pressure lies outside its footprint or the pad, or the load is too large. The result
+        then lies within the limits.
     """
     force = wrench[2]
     pressed = force > 0
@@ -199,17 +181,10 @@ def _newton(
 ) -> Float[Array, "3"]:
     """Find the plane `u0 + u1 y + u2 x` by which an object must move down so that the springs carry the load.
 
-    Args:
-        height: Heights of the object before the motion (m), finite.
-        x: x of the columns, relative to the centre of pressure and divided by `_LEVER`.
-        y: y of the rows, likewise.
-        target: Wanted sums of the springs' compressions, and of the compressions times y and x (m).
-        start: First iterate of u (m).
-        bound: Largest absolute values of u (m).
-        limit: Compression at which a spring meets the hard bottom (m).
-
-    Returns:
-        The unknowns u within their bounds. If the bounds exclude the target, the sums are near it.
+    `height` (m) is finite. x and y of the columns and rows are relative to the centre of pressure and divided by
+    `_LEVER`. `target` has the wanted sums of the springs' compressions, and of the compressions times y and x (m).
+    `start` is the first u, `bound` the largest absolute values of u (m). If they exclude the target, the sums are near
+    it. `limit` is the compression at which a spring meets the hard bottom (m).
     """
     near_bound = 0.9999 * bound
 

@@ -17,12 +17,10 @@ def surface_normals(
     paper, supplement "Simulator Details").
 
     Args:
-        points: x, y and z of the points in the sensor frame (m), three arrays of shape (a, b, *n). The grid has a rows
-            and b columns. The axes *n are batch axes of separate grids.
+        points: x, y and z of the points in the sensor frame (m), with any batch axes behind rows and columns.
 
     Returns:
-        Unit normals with a z component <= 0, which point towards the camera, of shape (h, w, *n, 3). The outermost rows
-        and columns of the grid have no normals, so h = a - 2 and w = b - 2.
+        Normals with z <= 0, towards the camera. The outermost rows and columns have none, so h = a - 2 and w = b - 2.
     """
     height, width = (n - 2 for n in points[0].shape[:2])
     # Differences from the middle point, in millimetres, preserve the precision of float32.
@@ -63,18 +61,8 @@ def smallest_eigenvector(
     of this matrix, divided by its length.
 
     The derivative exists if lambda differs from lambda_1 and from lambda_2, even if lambda_1 equals lambda_2. If lambda
-    equals lambda_1 or lambda_2, the result is an arbitrary unit vector with zero gradient.
-
-    Args:
-        xx: Elements (0, 0) of the matrices. Six separate arrays are faster on a CPU than one.
-        yy: Elements (1, 1).
-        zz: Elements (2, 2).
-        xy: Elements (0, 1).
-        xz: Elements (0, 2).
-        yz: Elements (1, 2).
-
-    Returns:
-        Components x, y and z of the vectors. Their signs are arbitrary.
+    equals lambda_1 or lambda_2, the result is an arbitrary unit vector with zero gradient. The signs of the vectors are
+    arbitrary. Six separate arrays of elements are faster on a CPU than one.
     """
     mean = (xx + yy + zz) / 3
     a, b, c = xx - mean, yy - mean, zz - mean

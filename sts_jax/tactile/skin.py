@@ -1,9 +1,6 @@
 """Tactile image from the imprint of an object: smoothing, directional and point lights, shadows, Phong reflectance.
 
-The skin is the paint on the gel's outer face. The tactile image shows the inner side of the skin while the internal
-lights are on. An imprint is the depth of the skin below the gel's undeformed face (m). The deeper the skin is pressed,
-the darker it is in the image (`darken`).
-
+The skin is the paint on the gel's outer face. The tactile image shows its inner side while the internal lights are on.
 Images are float32, (height, width, 3), and not clipped to [0, 1]. `sense` clips them as its last step.
 """
 
@@ -29,10 +26,9 @@ Scalar = float | Array
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Lights:
-    """Lights inside the sensor, modelled as directional lights. There may be any number m of lights.
-
-    The defaults are taken from the code of the See-Through-your-Skin paper: four lights in the gel's plane, one from
-    each edge of the image.
+    """Any number m of directional lights inside the sensor.
+     The defaults are those of the See-Through-your-Skin paper's code: four lights in the gel's plane, one from each
+    edge of the image.
     """
 
     # Directions from the skin towards the lights, sensor frame. Any length > 0. Defaults: left, right, top and bottom
@@ -50,7 +46,7 @@ class Lights:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Leds:
-    """Lights inside the sensor, modelled as points at a finite distance. There may be any number m of lights.
+    """Any number m of lights inside the sensor, as points at a finite distance.
 
     By default, a red, a green, a blue and a white LED shine at a grazing angle into the four edges of the pad. They are
     about as bright as possible without clipped pixels in the image of the untouched pad.
@@ -78,10 +74,7 @@ class Leds:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Skin:
-    """Constants for the smoothing of an imprint, and for the shadows that the skin casts on itself.
-
-    The skin is the paint on the gel's outer face.
-    """
+    """Smoothing of an imprint, and the shadows that the skin casts on itself."""
 
     # Standard deviation of the Gaussian that smooths the imprint (m). The default is 0, as in the paper.
     coupling: Scalar = dataclasses.field(default=0.0, metadata=NOT_NEGATIVE)
@@ -121,17 +114,13 @@ class Phong:
 def couple(depth: Float[Array, "h w"], length: Scalar, pitch: Float[Array, "2"]) -> Float[Array, "h w"]:
     """Smooth an imprint with a Gaussian, because real skin does not follow a sharp edge.
 
-    The weight of a pixel at distance r is `exp(-r^2 / (2 length^2))`, divided by the sum of the weights over the image.
-    A uniform imprint is therefore unchanged, also at the border of the image.
+    The weight of a pixel at distance r is `exp(-r^2 / (2 length^2))`, divided by the sum of the weights over the image,
+    so that a uniform imprint is unchanged, also at the border.
 
     Args:
-        depth: Depth of the imprint below the gel's undeformed face (m), finite.
-        length: Standard deviation of the Gaussian (m). If it is less than a twentieth of a pixel, the depth is
-            returned unchanged.
+        depth: Depth of the imprint (m), finite.
+        length: Standard deviation of the Gaussian (m). Below a twentieth of a pixel, the depth is unchanged.
         pitch: Distance between pixels along x and along y (m).
-
-    Returns:
-        Depth of the skin (m).
     """
 
     def band(number: int, step: Array) -> Float[Array, "a a"]:
@@ -147,28 +136,23 @@ def couple(depth: Float[Array, "h w"], length: Scalar, pitch: Float[Array, "2"])
 def shadows(
     skin: Skin, lights: Lights | Leds, depth: Float[Array, "h w"], window: Float[Array, "4"]
 ) -> Float[Array, "m h w"]:
-    """For each pixel and light, compute the share of the light that other parts of the skin do not hide.
-
-    Pressed parts of the skin stand out into the gel, through which the light travels. They cast shadows on the skin
+    """For each light and pixel, compute the share of the light that other parts of the skin do not hide.
+     Pressed parts of the skin stand out into the gel, through which the light travels, and cast shadows on the skin
     behind them. The share of a light at a point x of the skin is
 
         share = clip(1 - (atan(max_t (d(x + t u) - d(x)) / t) - e) / penumbra, 0, 1)
-
-    d is the depth of the skin, u the unit vector along the gel's face from x towards the light, and t the distance
-    along u. An elevation is the angle between a direction from x and the gel's plane (rad), positive into the gel. The
-    arctangent is the largest elevation of the skin at the points x + t u. e is the elevation of the light's lower edge,
-    and e + penumbra is the elevation of the light's upper edge.
-
-    A light in the gel's plane, as in the paper, has e = 0. Such a light does not illuminate flat skin or the
-    tops of pressed parts, because the normals there are perpendicular to the direction of the light. The shadows of
-    such a light are visible only where one pressed part casts a shadow on a slope of another pressed part. The shadow
-    is partial where the elevation of the part that casts the shadow is below `penumbra`.
+     d is the depth of the skin, u the unit vector along the gel's face from x towards the light, and t the distance
+    along u. The arctangent is the largest elevation (rad, above the gel's plane into the gel) of the skin at the points
+    x + t u. e is the elevation of the light's lower edge, and e + penumbra that of its upper edge.
+     A light in the gel's plane, as in the paper, has e = 0. It does not illuminate flat skin or the tops of pressed
+    parts, so its shadows are visible only where one pressed part casts a shadow on a slope of another. The shadow is
+    partial where the elevation of the part that casts it is below `penumbra`.
 
     Args:
-        skin: Constants of the shadows: number of steps n, reach and penumbra. Step k compares the depth at x with the
-            depth at the distance `t = shadow_reach (k / n)^2`. Steps are longer far from x, so a distant part that is
-            narrower than a step may cast no shadow on x.
-        lights: Far lights (`Lights`) or near lights (`Leds`). Skin behind a near light does not hide this light.
+        skin: Number of steps n, reach and penumbra. Step k compares the depth at x with the depth at the distance `t =
+            shadow_reach (k / n)^2`. Steps are longer far from x, so a distant part that is narrower than a step may
+            cast no shadow on x.
+        lights: Skin behind a near light (`Leds`) does not hide this light.
         depth: Depth of the skin below the gel's undeformed face (m). Skin outside the image casts no shadow.
         window: Part of the gel's face in the image: left, top, width, height (m).
 
@@ -226,19 +210,17 @@ def phong(
         I = k_a i_a + sum_m (k_d (L_m . N) + k_s (R_m . V)^alpha) i_m,   R_m = 2 (L_m . N) N - L_m
 
     k_a, i_a, k_d, k_s and alpha are the fields `ambient`, `ambient_color`, `diffuse`, `specular` and `shininess` of
-    `Phong`. N is the normal, L_m the unit vector to light m, and i_m the colour of light m. In the formula for I,
-    negative values of (L_m . N) and (R_m . V) count as 0. V is the unit vector to the viewer. It is (0, 0, -1) at all
-    points, as for a distant viewer, so that flat skin under far lights is uniform.
-
-    For a near light at the position p_m, the colour is multiplied by `(reference / |p_m - x|)^falloff` at the point x.
-    `reference` and `falloff` are fields of `Leds`. Distances below 0.1 mm count as 0.1 mm.
+    `Phong`. N is the normal, L_m the unit vector to light m, and i_m the colour of light m. Negative (L_m . N) and
+    (R_m . V) count as 0. V = (0, 0, -1) at all points, as for a distant viewer, so that flat skin under far lights is
+    uniform. The colour of a near light at p_m is multiplied by `(reference / |p_m - x|)^falloff` at the point x, where
+    distances below 0.1 mm count as 0.1 mm.
 
     Args:
         phong: Constants of the skin's reflectance.
-        lights: Far lights (`Lights`) or near lights (`Leds`). Directions of far lights may have any length > 0.
+        lights: Far lights (`Lights`), of any length > 0, or near lights (`Leds`).
         normals: Unit normals towards the camera.
         points: Points of the skin in the sensor frame (m). Only near lights use them.
-        shares: Share of each light that reaches each point, as returned by the function `shadows`. None for no shadows.
+        shares: Share of each light that reaches each point, from `shadows`. None for no shadows.
 
     Returns:
         Image of the skin, not clipped.
@@ -271,13 +253,5 @@ def _unit(*parts: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], ...]:
 
 
 def darken(phong: Phong, depth: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Brightness of the skin relative to flat skin: `exp(-depth / phong.darkening)`.
-
-    Args:
-        phong: Constants of the skin's reflectance.
-        depth: Depth of the imprint (m).
-
-    Returns:
-        Factor of the brightness, 1 at depth 0.
-    """
+    """Brightness of the skin at the depth (m) of the imprint, relative to flat skin: `exp(-depth / darkening)`."""
     return jnp.exp(-depth / phong.darkening)

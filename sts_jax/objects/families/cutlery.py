@@ -12,9 +12,7 @@ SHEET = 1.5  # mm, thickness of the steel
 
 
 def handle(rng: np.random.Generator, length: float, end: float, lift: float) -> tuple[Part, Color, float]:
-    """Return a random handle of a fork or a spoon, along the x axis.
-
-    The handle begins on the table at x = 0. It ends at its neck, where the tines or the bowl begin.
+    """Return a random handle of a fork or a spoon, along the x axis, from the table at x = 0 to its neck.
 
     Args:
         rng: Generator of the random dimensions and colours.
@@ -23,7 +21,7 @@ def handle(rng: np.random.Generator, length: float, end: float, lift: float) -> 
         lift: Height of the neck above the table (mm).
 
     Returns:
-        The handle, the colour of the steel in linear light, and the width of the neck (mm).
+        The handle, the colour of the steel, and the width of the neck (mm).
     """
     arch = length * rng.uniform(0.015, 0.05)  # rise of the handle in its middle
     wide = length * rng.uniform(0.075, 0.12)  # width of its end
