@@ -15,10 +15,11 @@ def cache_folder() -> Path:
 
 def enable_compilation_cache(folder: str | os.PathLike[str] | None = None) -> Path | None:
     """Let JAX keep compiled programs on disk, so that the next session loads them.
-     Call this function once, before the first computation. It changes JAX's settings for the whole process. The
-    commands in `experiments` call it; the library itself never does. On a CPU, XLA logs a harmless error about
-    processor features for each program that it loads (JAX issue 38445): set TF_CPP_MIN_LOG_LEVEL=3 before `import jax`
-    to hide it.
+
+    Call this function once, before the first computation. It changes JAX's settings for the whole process. The commands
+    in `experiments` call it; the library itself never does. On a CPU, XLA logs a harmless error about processor
+    features for each program that it loads (JAX issue 38445): set TF_CPP_MIN_LOG_LEVEL=3 before `import jax` to hide
+    it.
 
     Args:
         folder: Folder of the cache. None selects JAX_COMPILATION_CACHE_DIR, or, if that variable is not set, a folder

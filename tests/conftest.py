@@ -42,6 +42,13 @@ jaxtyping.install_import_hook("sts_jax", "checker.check")
 MOST_MAPS = 30_000  # memory maps of a process. Linux allows 65,530, and XLA crashes beyond that
 
 
+@pytest.fixture
+def strict_ranks():
+    """Arrays of different ranks are not broadcast against each other without a word."""
+    with jax.numpy_rank_promotion("raise"):
+        yield
+
+
 @pytest.fixture(autouse=True, scope="module")
 def release_compiled_programs():
     """Drop all compiled programs before their memory maps reach the limit of the process."""

@@ -1,6 +1,5 @@
 """The code of docs/extending.md runs, and a class from outside the library behaves as the eight do."""
 
-import inspect
 import sys
 from pathlib import Path
 
@@ -100,10 +99,10 @@ def test_parts_that_make_no_body_are_refused(change, message):
         objects.make(jax.random.key(0), bad)
 
 
-@pytest.mark.parametrize("seed", [-1, 1.5, None, True])
+@pytest.mark.parametrize("seed", [-1, True])
 def test_an_invalid_seed_is_refused(seed):
     with pytest.raises(ValueError, match=f"family ring: seed must be a whole number >= 0, got {seed!r}"):
-        inspect.unwrap(objects.Family.__init__)(object.__new__(objects.Family), "ring", seed, ring)
+        objects.Family("ring", seed, ring)
 
 
 @pytest.mark.slow

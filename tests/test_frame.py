@@ -10,19 +10,14 @@ import trimesh
 from optics_bodies import body_mesh, embree, from_trimesh, interior
 
 import sts_jax as sts
-from sts_jax import objects, tactile
+from sts_jax import objects, sense, tactile
 from sts_jax.rendering import drawing, equilibrium
+
+pytestmark = pytest.mark.usefixtures("strict_ranks")
 
 SENSOR = sts.Sensor()
 SIZES = [(64, 64), *(pytest.param(size, marks=pytest.mark.slow) for size in ((97, 53), (200, 200)))]
 FLAT = np.array([178, 178, 204]) / 255
-sense = sts.sense  # compiled: one equilibrium program serves every resolution
-
-
-@pytest.fixture(autouse=True)
-def strict_ranks():
-    with jax.numpy_rank_promotion("raise"):
-        yield
 
 
 # The strokes of an F as a reader sees it who looks out through the gel. Sensor frame, mm: (left, right, top, bottom).
@@ -65,6 +60,9 @@ def at(x, y, z):
 def test_a_letter_is_not_mirrored_in_either_stream(resolution):
     frame = sense(SENSOR, letter(), at(0, 0, -0.0008), resolution=resolution)
     height, width = resolution
+    for image in (frame.visual, frame.tactile):
+        assert (image.dtype, image.shape) == (jnp.float32, (*resolution, 3))
+        assert 0 <= float(jnp.min(image)) < float(jnp.max(image)) <= 1
     scale = height / 150  # pixels per mm on the gel's face
 
     def pixel(x, y):
@@ -80,10 +78,8 @@ def test_a_letter_is_not_mirrored_in_either_stream(resolution):
         np.testing.assert_allclose(np.asarray(frame.tactile)[pixel(x, y)], FLAT, atol=0.02)
 
 
-@pytest.mark.parametrize("resolution", SIZES)
-@pytest.mark.parametrize("category", ["spoon", "camera"])
-def test_depth_and_segmentation_equal_embrees_for_the_balanced_pose(category, resolution):
-    body = objects.make(jax.random.key(4), category)
+def test_depth_and_segmentation_equal_embrees_for_the_balanced_pose():
+    body, resolution = objects.make(jax.random.key(4), "spoon"), (64, 64)
     pose = jnp.asarray([0.01, -0.01, 0.03, 0.8, 0.6, 0.0, 0.0])
     frame = sense(SENSOR, body, pose, weight(0.0, 0, 0), resolution=resolution)
     truth = embree(body_mesh(body, frame.pose), SENSOR.camera, resolution)
@@ -94,10 +90,9 @@ def test_depth_and_segmentation_equal_embrees_for_the_balanced_pose(category, re
     assert np.array_equal(np.isfinite(frame.depth), frame.segmentation)
 
 
-@pytest.mark.parametrize("resolution", SIZES)
-def test_depth_of_the_balanced_pose_matches_its_pressure(resolution):
+def test_depth_of_the_balanced_pose_matches_its_pressure():
     pose = at(0.012, -0.008, 0.0302)
-    frame = sense(SENSOR, ball(), pose, weight(1.0, 0.012, -0.008), resolution=resolution)
+    frame = sense(SENSOR, ball(), pose, weight(1.0, 0.012, -0.008))
     assert bool(frame.balanced)
     assert float(jnp.sum(frame.pressure)) * 1e-6 == pytest.approx(1.0, rel=0.005)
     # A ball of radius R with its centre at z reaches R - z below the face.
@@ -124,25 +119,10 @@ def test_tilt_of_the_balanced_pose_matches_its_pressure():
     assert plane[0] < 0 < plane[1]  # deeper towards the centre of pressure
 
 
-@pytest.mark.parametrize("body", [ball(), letter()], ids=["ball", "letter"])
-def test_more_load_never_makes_the_imprint_smaller(body):
-    start = float(-np.asarray(body.vertices)[:, 2].min())
-    sizes, dark = [], []
-    for force in (0.0, 0.05, 0.2, 0.5, 1.0, 2.0, 4.0):
-        frame = sense(SENSOR, body, at(0, 0, start), weight(force, 0, 0))
-        change = np.abs(np.asarray(frame.tactile) - FLAT).max(-1)
-        sizes.append(int((change > 1.5 / 255).sum()))
-        dark.append(float((FLAT - np.asarray(frame.tactile)).sum()))
-    assert sizes[0] == 0
-    assert np.all(np.diff(sizes) >= 0)
-    assert sizes[-1] > sizes[1] > 0
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("resolution", "crop"), [((64, 64), False), ((64, 64), True), ((97, 53), False), ((200, 200), True)]
-)
-def test_images_are_empty_after_an_object_has_fallen_off(resolution, crop):
+@pytest.mark.parametrize("crop", [False, True])
+def test_images_are_empty_after_an_object_has_fallen_off(crop):
+    resolution = (97, 53)
     gone = sense(SENSOR, ball(), at(0.12, 0.0, -0.08), weight(0, 0, 0), resolution=resolution, crop=crop)
     far = sense(SENSOR, ball(), at(5.0, 0.0, 0.1), weight(0, 0, 0), resolution=resolution, crop=crop)
     assert not np.any(gone.segmentation)
@@ -179,17 +159,6 @@ def test_a_non_finite_input_gives_an_unbalanced_frame_with_finite_images(bad, wh
         assert np.all(np.isfinite(image))
 
 
-@pytest.mark.parametrize("resolution", SIZES)
-def test_images_lie_in_0_to_1(resolution):
-    frame = sense(SENSOR, letter(), at(0.01, 0.02, 0.0), weight(3.0, 0.012, 0.02), resolution=resolution)
-    for image in (frame.visual, frame.tactile):
-        assert image.dtype == jnp.float32
-        assert image.shape == (*resolution, 3)
-        assert float(jnp.min(image)) >= 0
-        assert float(jnp.max(image)) <= 1
-    assert frame.depth.shape == resolution
-
-
 @pytest.mark.slow
 def test_a_crop_agrees_with_the_whole_image():
     body = letter()
@@ -222,37 +191,6 @@ def test_vmap_agrees_with_single_frames():
         np.testing.assert_allclose(batch.tactile[k], one.tactile, atol=2e-3)
         np.testing.assert_allclose(batch.visual[k], one.visual, atol=2e-3)
         assert bool(batch.balanced[k]) == bool(one.balanced)
-
-
-@pytest.mark.slow
-def test_objects_of_one_size_class_share_a_compilation():
-    programs = []
-    for k, category in enumerate(("bottle", "watch", "fork")):
-        body = objects.make(jax.random.key(k), category)
-        assert body.faces.shape == (objects.FACE_CLASSES[0], 3)
-        sense(SENSOR, body, at(0, 0, 0.05), weight(0, 0, 0))
-        programs.append((equilibrium.balance._cache_size(), drawing.draw._cache_size()))
-    assert programs[0] == programs[1] == programs[2]
-
-
-@pytest.mark.slow
-def test_gradients_by_load_and_stiffness_equal_finite_differences():
-    body = ball()
-
-    def dark(stiffness, force):
-        sensor = dataclasses.replace(SENSOR, gel=dataclasses.replace(SENSOR.gel, stiffness=stiffness))
-        frame = sts.sense(sensor, body, at(0, 0, 0.03), weight(1.0, 0.0, 0.0) * force)
-        return jnp.mean(frame.tactile)
-
-    both = jax.jit(jax.value_and_grad(dark, argnums=(0, 1)))
-    cases = {"here": (2e6, 1.0), "stiffer": (2.04e6, 1.0), "softer": (1.96e6, 1.0)}
-    cases |= {"heavier": (2e6, 1.02), "lighter": (2e6, 0.98)}
-    found = {name: both(jnp.float32(k), jnp.float32(force)) for name, (k, force) in cases.items()}
-    value, gradient = {name: v for name, (v, _) in found.items()}, found["here"][1]
-    by_stiffness = (value["stiffer"] - value["softer"]) / 0.08e6
-    by_force = (value["heavier"] - value["lighter"]) / 0.04
-    assert float(gradient[0]) == pytest.approx(float(by_stiffness), rel=0.1)
-    assert float(gradient[1]) == pytest.approx(float(by_force), rel=0.1)
 
 
 @pytest.mark.slow
@@ -301,21 +239,13 @@ def test_moving_edges_derivative_equals_finite_differences_at_upright_walls():
 
 
 @pytest.mark.slow
-def test_bodies_with_other_hulls_and_contents_share_a_compilation():
-    body, other = (sts.objects.make(jax.random.key(0), category) for category in ("bottle", "fork"))
-    other = dataclasses.replace(other, hulls=other.hulls[:, :32], interior=other.interior[:8])
-    assert body.hulls.shape != other.hulls.shape
-    pose = jnp.array([0.0, 0, 0.01, 1, 0, 0, 0])
-    sts.sense(SENSOR, body, pose, resolution=(24, 24))
+def test_bodies_of_one_size_class_share_programs_and_a_new_resolution_compiles_only_the_drawing():
+    body, fork, watch = (objects.make(jax.random.key(0), category) for category in ("bottle", "fork", "watch"))
+    fork = dataclasses.replace(fork, hulls=fork.hulls[:, :32], interior=fork.interior[:8])  # these are not drawn
+    sense(SENSOR, body, at(0, 0, 0.01), resolution=(24, 24))
     before = equilibrium.balance._cache_size(), drawing.draw._cache_size()
-    sts.sense(dataclasses.replace(SENSOR, phong=tactile.Phong(ambient=0.7)), other, pose, resolution=(24, 24))
+    for other in (fork, watch):
+        sense(dataclasses.replace(SENSOR, phong=tactile.Phong(ambient=0.7)), other, at(0, 0, 0.01), resolution=(24, 24))
     assert (equilibrium.balance._cache_size(), drawing.draw._cache_size()) == before
-
-
-@pytest.mark.slow
-def test_another_resolution_compiles_only_the_drawing():
-    body, pose = sts.objects.make(jax.random.key(0), "bottle"), jnp.array([0.0, 0, 0.01, 1, 0, 0, 0])
-    sts.sense(SENSOR, body, pose, resolution=(24, 24))
-    before = equilibrium.balance._cache_size()
-    sts.sense(SENSOR, body, pose, resolution=(2, 3))
-    assert equilibrium.balance._cache_size() == before
+    sense(SENSOR, body, at(0, 0, 0.01), resolution=(2, 3))
+    assert (equilibrium.balance._cache_size(), drawing.draw._cache_size()) == (before[0], before[1] + 1)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import sts_jax as sts
-from sts_jax import objects
 
 expose = jax.jit(sts.expose)
 SENSOR = sts.Sensor()
@@ -46,11 +45,9 @@ def encode(x):
     return 12.92 * x if x <= 0.0031308 else 1.055 * x ** (1 / 2.4) - 0.055
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("exposure", [1.0, 6.0])
-@pytest.mark.parametrize("shape", [(64, 64), (97, 53), (200, 200), (1232, 1640)])
-def test_light_0_and_1_return_the_streams_exactly(shape, exposure):
-    frame, sensor = noise(shape), with_exposure(exposure)
+def test_light_0_and_1_return_the_streams_exactly(exposure):
+    frame, sensor = noise((97, 53)), with_exposure(exposure)
     for call in (expose, sts.expose):
         assert np.array_equal(call(sensor, frame, 0.0), frame.visual)
         assert np.array_equal(call(sensor, frame, 1.0), frame.tactile)
@@ -69,8 +66,8 @@ def test_half_light_of_a_pressed_object_lies_between_the_streams():
 
 
 @pytest.mark.parametrize("exposure", [1.0, 6.0])
-@pytest.mark.parametrize("shape", [(64, 64), (97, 53), (200, 200), (1232, 1640)])
-def test_light_is_added_in_linear_units(shape, exposure):
+def test_light_is_added_in_linear_units(exposure):
+    shape = (97, 53)
     frame = noise(shape)
     rng = np.random.default_rng(1)
     for light in (1e-3, 0.2, 0.5, 0.9):

@@ -18,7 +18,7 @@ from optics_bodies import from_trimesh
 import sts_jax as sts
 from sts_jax import optics, tactile
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("strict_ranks")]
 
 SHAPE = (40, 40)
 STEP = 1e-5  # length of a step, over a visible change of the parameter
@@ -41,12 +41,6 @@ SENSORS = {
     name: sts.Sensor(gel=GEL, lights=lights, skin=SKIN, phong=DIM, room=ROOM)
     for name, lights in (("far", FAR), ("near", NEAR))
 }
-
-
-@pytest.fixture(autouse=True)
-def strict_ranks():
-    with jax.numpy_rank_promotion("raise"):
-        yield
 
 
 # Both have one size class and share a program.

@@ -13,10 +13,9 @@ from optics_bodies import body_mesh, from_trimesh, public_meshes
 from PIL import Image
 
 import sts_jax as sts
-from sts_jax import objects
+from sts_jax import objects, sense
 
 SENSOR = sts.Sensor()
-sense = sts.sense  # compiled: one equilibrium program serves every resolution
 
 
 def with_room(**changes):
@@ -27,9 +26,7 @@ def at(x, y, z):
     return jnp.array([x, y, z, 1.0, 0, 0, 0], jnp.float32)
 
 
-@pytest.mark.parametrize(
-    "resolution", [(64, 64), *(pytest.param(size, marks=pytest.mark.slow) for size in ((97, 53), (200, 200)))]
-)
+@pytest.mark.parametrize("resolution", [(64, 64), pytest.param((97, 53), marks=pytest.mark.slow)])
 def test_an_object_on_the_pad_darkens_the_skin_around_it(resolution):
     body = from_trimesh(trimesh.creation.cylinder(radius=0.015, height=0.06))
     empty = np.asarray(sense(SENSOR, body, at(0, 0, -1.0), resolution=resolution).visual)
@@ -74,24 +71,6 @@ def test_the_view_beyond_the_pad_is_a_dark_housing_also_behind_an_object():
         assert image[:, beyond].max() < 0.35 * image[:, 64].max()
         inwards = image[48, :15].mean(-1)
         assert np.all(np.diff(inwards) > 0)  # brightest just below the pad's edge
-
-
-def test_shadow_milk_and_tint_hardly_reduce_the_contrast_of_objects():
-    plain = with_room(milk=0.0, crease=0.0, haze=0.3, tint=jnp.ones(3))
-    empty = np.asarray(sense(SENSOR, objects.make(jax.random.key(0), "fork"), at(0, 0, -1.0)).visual)
-    for height, least in ((0.0, 1.0), (0.05, 0.9)):
-        apart = []
-        for category in objects.CATEGORIES:
-            body = objects.make(jax.random.key(1), category)
-            low = float(jnp.min(body.vertices[:, 2]))
-            row = []
-            for sensor in (SENSOR, plain):
-                frame = sense(sensor, body, at(0, 0, height - low), jnp.zeros(6))
-                seen = np.asarray(frame.segmentation)
-                row.append(np.abs(np.asarray(frame.visual) - empty)[seen].mean())
-            apart.append(row)
-        ours, before = np.mean(apart, axis=0)
-        assert ours > least * before
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from optics_bodies import from_trimesh
 
 import sts_jax as sts
 from experiments.shared.laying import Config, lay
-from sts_jax import geometry, objects, tactile
+from sts_jax import geometry, objects, sense, tactile
 
 pytestmark = pytest.mark.slow
 
@@ -23,7 +23,6 @@ RADIUS = 0.03  # m
 FORCE = 0.5  # N, on the sphere
 SIZES = (64, 200, 640)  # as in test_frame.py: one program each
 NAMES = ("sphere", "bottle", "scissors", "box")
-sense = sts.sense  # compiled: one equilibrium program serves every resolution
 
 
 @functools.cache

@@ -8,11 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from sts_jax import geometry
 
-
-@pytest.fixture(autouse=True)
-def strict_ranks():
-    with jax.numpy_rank_promotion("raise"):
-        yield
+pytestmark = pytest.mark.usefixtures("strict_ranks")
 
 
 def rotations(num, seed=0):

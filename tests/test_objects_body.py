@@ -70,10 +70,6 @@ def test_repr_describes_a_body_in_one_line_also_while_traced(jar):
     seen = []
     jax.jit(lambda body: seen.append(repr(body)))(made)
     assert "vertices=float32[1024, 3]" in seen[0]
-    object.__setattr__(made, "vertices", jax.ShapeDtypeStruct((1024, 3), jnp.float32))  # past the tests' own checks
-    object.__setattr__(made, "hulls", None)
-    assert "vertices=float32[1024, 3]" in repr(made)
-    assert "hulls=None" in repr(made)
 
 
 @pytest.mark.parametrize(
@@ -158,13 +154,8 @@ def test_stacked_bodies_can_be_mapped_over():
     np.testing.assert_allclose(mass, [float(objects.rigid(b, 0.5, 1.0)[0]) for b in bodies], rtol=1e-6)
     with pytest.raises(ValueError, match="at least one"):
         objects.stack([])
-
-
-def test_stack_refuses_two_classes(tmp_path):
-    path = tmp_path / "box.stl"
-    trimesh.creation.box((0.06, 0.04, 0.1)).export(path)
     with pytest.raises(ValueError, match="arrays of body 1 and body 0 have different shapes"):
-        objects.stack([objects.make(jax.random.key(0), "bottle"), objects.load(path)])
+        objects.stack([bodies[0], dataclasses.replace(bodies[0], hulls=bodies[0].hulls[:, :4])])
 
 
 def test_a_mirrored_body_is_that_of_the_mirrored_mesh(jar, tmp_path):

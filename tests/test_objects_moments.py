@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from sts_jax.objects import fill_moments
-from sts_jax.objects.moments import solid_moments, surface_moments
+from sts_jax.objects.assembly import solid_moments, surface_moments
 
 FILLS = np.linspace(0, 1, 33)
 _TABLE = jax.jit(jax.vmap(fill_moments, in_axes=(None, 0, None)))
@@ -108,8 +108,6 @@ def test_fills_along_opposite_directions_add_up_to_the_whole():
 def test_whole_solid_agrees_with_trimesh():
     mesh = twisted()
     total = solid_moments(mesh.triangles).sum(0)
-    elsewhere = solid_moments(mesh.triangles, reference=np.array([0.3, -0.2, 0.1])).sum(0)
-    np.testing.assert_allclose(total, elsewhere, rtol=1e-9)
     np.testing.assert_allclose(total[0], mesh.volume)
     np.testing.assert_allclose(total[1:4] / total[0], mesh.center_mass)
     central = total[4:7] - total[0] * (total[1:4] / total[0]) ** 2

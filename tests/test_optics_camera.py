@@ -1,19 +1,14 @@
 """Geometry of the pinhole against values computed by hand."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from sts_jax import optics
 
+pytestmark = pytest.mark.usefixtures("strict_ranks")
+
 CAMERA = optics.Camera()
-
-
-@pytest.fixture(autouse=True)
-def strict_ranks():
-    with jax.numpy_rank_promotion("raise"):
-        yield
 
 
 @pytest.mark.parametrize(

@@ -11,15 +11,11 @@ from optics_bodies import rays_hidden
 
 from sts_jax import optics
 
+pytestmark = pytest.mark.usefixtures("strict_ranks")
+
 PAD = (0.15, 0.15)  # m
 CELLS = (150, 150)
 SHAPES = [(64, 64), (97, 53), (200, 200), (1232, 1640)]
-
-
-@pytest.fixture(autouse=True)
-def strict_ranks():
-    with jax.numpy_rank_promotion("raise"):
-        yield
 
 
 def test_srgb_conversion_equals_the_standard():
@@ -70,17 +66,6 @@ def test_shading_equals_lamberts_law_behind_a_milky_skin(shape):
         sky = empty[i, j] / (1 - room.milk * hidden[i, j])
         expected = (1 - room.milk) * behind + room.milk * (1 - hidden[i, j]) * sky
         np.testing.assert_allclose(got[i, j], expected, atol=1e-5)
-
-
-def test_shading_of_listed_samples_equals_that_of_an_image():
-    room = optics.Room()
-    arrays = [jnp.asarray(a, jnp.float32) for a in samples((20, 30))]
-    image = optics.shade(room, *arrays)
-    few = np.random.default_rng(0).integers(600, size=77)
-    listed = [a.reshape(600, *a.shape[2:])[few] for a in arrays]
-    np.testing.assert_allclose(optics.shade(room, *listed), image.reshape(600, 3)[few], atol=1e-6)
-    alone = [a[3] for a in listed]
-    np.testing.assert_allclose(optics.shade(room, *alone), image.reshape(600, 3)[few[3]], atol=1e-6)
 
 
 @pytest.mark.parametrize("shape", SHAPES)

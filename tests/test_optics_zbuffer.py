@@ -9,14 +9,10 @@ from optics_bodies import body_mesh, embree, from_trimesh, interior, public_mesh
 
 from sts_jax import geometry, objects, optics
 
+pytestmark = pytest.mark.usefixtures("strict_ranks")
+
 CAMERA = optics.Camera()
 SHAPES = [(64, 64), (97, 53), (200, 200)]
-
-
-@pytest.fixture(autouse=True)
-def strict_ranks():
-    with jax.numpy_rank_promotion("raise"):
-        yield
 
 
 def draw(vertices, faces, two_sided, pose, shape):

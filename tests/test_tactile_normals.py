@@ -9,13 +9,9 @@ from tactile_surfaces import SHAPES, bumpy, normals_of, some_pixels
 from sts_jax import tactile
 from sts_jax.tactile.normals import smallest_eigenvector
 
+pytestmark = pytest.mark.usefixtures("strict_ranks")
+
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-
-
-@pytest.fixture(autouse=True)
-def strict_ranks():
-    with jax.numpy_rank_promotion("raise"):
-        yield
 
 
 def elements(matrix):

@@ -6,10 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.special import erf
 from tactile_surfaces import SHAPES, SMALL, bumpy, normals_of, some_pixels
 
 from sts_jax import tactile
+
+pytestmark = pytest.mark.usefixtures("strict_ranks")
 
 WINDOW = np.array([-0.08, -0.07, 0.16, 0.14])  # m
 LEDS = tactile.Leds(
@@ -19,12 +20,6 @@ LEDS = tactile.Leds(
     reference=0.06,
 )
 SKIN = tactile.Skin(shadow_steps=12, shadow_reach=0.03, penumbra=0.08)
-
-
-@pytest.fixture(autouse=True)
-def strict_ranks():
-    with jax.numpy_rank_promotion("raise"):
-        yield
 
 
 def places(shape):
@@ -83,15 +78,6 @@ def test_phong_equals_the_papers_equation(shape, lights):
         )
 
 
-@pytest.mark.parametrize("lights", [tactile.Lights(), LEDS], ids=["far", "near"])
-def test_phong_of_listed_points_equals_that_of_the_image(lights):
-    shape = (31, 17)
-    normals, points = (jnp.asarray(v, jnp.float32) for v in (some_normals(shape), bumpy(shape)))
-    image = tactile.phong(tactile.Phong(), lights, normals, points)
-    listed = tactile.phong(tactile.Phong(), lights, normals.reshape(-1, 3), points.reshape(-1, 3))
-    np.testing.assert_array_equal(image.reshape(-1, 3), listed)
-
-
 def test_leds_far_away_equal_far_lights():
     lights = tactile.Lights(directions=jnp.array([[-1.0, 0.3, -0.2], [0, 1, 0], [0.2, 0.1, -1], [0.5, -0.5, -0.05]]))
     unit = lights.directions / jnp.linalg.norm(lights.directions, axis=1, keepdims=True)
@@ -104,18 +90,6 @@ def test_leds_far_away_equal_far_lights():
     far, near = (tactile.shadows(SKIN, v, depth, jnp.asarray(WINDOW, jnp.float32)) for v in (lights, leds))
     np.testing.assert_allclose(near, far, atol=0.02)
     assert float(jnp.mean(far < 0.5)) > 0.05
-
-
-def test_intensity_of_leds_falls_off_from_the_reference_distance():
-    flat = jnp.array([[0.0, 0, -1]])
-    leds = tactile.Leds(positions=jnp.array([[0.0, 0, -0.05]]), colors=jnp.array([[0.3, 0.2, 0.1]]), reference=0.05)
-    constants = tactile.Phong(ambient=0.0, specular=0.0)
-    at = tactile.phong(constants, leds, flat, jnp.zeros((1, 3)))
-    np.testing.assert_allclose(at, leds.colors, rtol=1e-5)
-    for falloff in (0.0, 1.0, 2.0, 3.5):
-        leds = dataclasses.replace(leds, falloff=falloff)
-        twice = tactile.phong(constants, leds, flat, jnp.array([[0.0, 0, 0.05]]))
-        np.testing.assert_allclose(twice, leds.colors / 2**falloff, rtol=1e-5)
 
 
 def test_flat_gel_has_the_colour_of_the_papers_code():
@@ -153,16 +127,6 @@ def test_coupling_equals_a_weighted_mean_over_the_image(shape, length):
     for i, j in some_pixels(shape, 60):
         weights = np.exp(-((x[None] - x[j]) ** 2 + (y[:, None] - y[i]) ** 2) / (2 * length**2))
         assert got[i, j] == pytest.approx(np.sum(weights * depth) / np.sum(weights), rel=1e-4, abs=1e-9)
-
-
-def test_a_coupled_edge_equals_an_error_function():
-    shape, length = (40, 300), 0.001
-    x = (np.arange(300) - 149.5) * 1e-4
-    depth = jnp.asarray(np.tile(np.where(x > 0, 0.002, 0), (40, 1)), jnp.float32)
-    got = tactile.couple(depth, length, jnp.array([1e-4, 2e-4]))
-    expected = 0.001 * (1 + erf(x / length / np.sqrt(2)))
-    away = np.abs(x) < 0.015 - 4 * length  # the weights do not reach beyond the image's border
-    np.testing.assert_allclose(got[:, away], np.tile(expected, (shape[0], 1))[:, away], atol=2e-6)
 
 
 @pytest.mark.parametrize("shape", SMALL)
@@ -372,11 +336,3 @@ def test_gradients_are_finite_for_degenerate_lights_and_normals():
         for shininess in (0.5, 5.0, 200.0):
             gradient = jax.grad(total, (0, 1, 2, 3))(given, normals, points, tactile.Phong(shininess=shininess))
             assert all(np.all(np.isfinite(g)) for g in jax.tree.leaves(gradient))
-
-
-def test_brightness_decays_exponentially_with_depth():
-    depth = jnp.linspace(0, 0.005, 20)[None]
-    dark = np.asarray(tactile.darken(tactile.Phong(), depth))[0]
-    assert dark[0] == 1
-    assert np.all(np.diff(dark) < 0)
-    np.testing.assert_allclose(dark, np.exp(-np.linspace(0, 0.005, 20) / 0.001), rtol=1e-5)

@@ -99,7 +99,8 @@ def corner_normals(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], *, crease: float = CREASE
 ) -> Float[np.ndarray, "f 3 3"]:
     """Unit normal at each corner of each face, so that shading is smooth except at sharp edges.
-     For a corner of the face F at the vertex v, the result is the normalised mean of the normals of faces that meet at
+
+    For a corner of the face F at the vertex v, the result is the normalised mean of the normals of faces that meet at
     v, weighted by their interior angles at v. Only faces whose normal is within `crease` (rad) of F's normal count. A
     face without area counts as one with the normal (0, 0, 1) and the weight 0.
     """

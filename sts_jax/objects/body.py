@@ -30,7 +30,8 @@ CATEGORIES = ("bottle", "camera", "webcam", "mouse", "scissors", "fork", "spoon"
 @dataclasses.dataclass(frozen=True)
 class Body:
     """A rigid object in its own mesh frame, as a pytree whose leaves are all arrays.
-     The object is a shell, whose interior can be filled with contents such as water (`rigid`). The origin lies inside
+
+    The object is a shell, whose interior can be filled with contents such as water (`rigid`). The origin lies inside
     the convex hull. The object usually stands or lies with +z up. The albedo at a point of a face is the texture's
     value times the colour that is interpolated between the corners (as in glTF), in linear light.
     """

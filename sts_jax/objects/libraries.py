@@ -56,7 +56,8 @@ def library(
     parts: bool = False,
 ) -> Library:
     """List the objects of a folder without opening a mesh.
-     If the folder or one of its direct sub-folders contains ShapeNetSem's metadata.csv, this table lists the objects,
+
+    If the folder or one of its direct sub-folders contains ShapeNetSem's metadata.csv, this table lists the objects,
     with their size (`unit`), orientation (`up`, `front`) and class (`category`), one of CATEGORIES. Meshes are expected
     at models-OBJ/models/ID.obj, and images in models-textures/textures. In any other folder, every mesh file is an
     object. Its class is the name of the first sub-folder in its path, or of the folder itself.
@@ -136,7 +137,8 @@ def _walked(folder: Path) -> tuple[list[Item], list[tuple[str, str]]]:
 
 def read(collection: Library, index: int) -> Entry:
     """Load one item as a body, through the cache if the library has one.
-     Scissors, forks and spoons are solid and of steel. All other objects are shells with contents. Warnings of `load`,
+
+    Scissors, forks and spoons are solid and of steel. All other objects are shells with contents. Warnings of `load`,
     such as those about repairs of the mesh, are returned as notes. Raises a ValueError with the reason if the file
     cannot be loaded as a body.
     """

@@ -48,8 +48,9 @@ def convex_parts(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3
 
 def decompose(body: Body) -> Body:
     """Replace the collision hull of a body by at most 8 convex parts of at most 32 vertices each.
-     A shape that is not convex, such as scissors or a bowl, is approximated better by several parts than by one hull.
-    If a single part is enough, the body is returned unchanged. This needs the package coacd.
+
+    A shape that is not convex, such as scissors or a bowl, is approximated better by several parts than by one hull. If
+    a single part is enough, the body is returned unchanged. This needs the package coacd.
     """
     parts = convex_parts(*_surface(body))
     if len(parts) == 1:

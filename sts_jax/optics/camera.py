@@ -45,7 +45,8 @@ def object_window(
     camera: Camera, points: Float[Array, "v 3"], resolution: tuple[int, int], *, smallest: float = 0.005
 ) -> Float[Array, "4"]:
     """Window (m) around an object (supplement of Rezaei-Shoshtari et al. 2021, "Training Details").
-     The smallest window that contains the bounding box of the points, projected to the gel's outer face and clipped to
+
+    The smallest window that contains the bounding box of the points, projected to the gel's outer face and clipped to
     the full window (`full_window`), has the aspect ratio of the image, lies within the full window and has a shorter
     side of at least `smallest` (m). If no point is in view, it is the full window.
 

@@ -104,17 +104,20 @@ def hidden_sky(
     y: Float[Array, "h"],
 ) -> Float[Array, "h w"]:
     """Share of the sky that an object hides from points on the skin, weighted by the cosine to the vertical.
-     The object is approximated by horizontal slices at a few heights z, from its lowest to its highest point. Within
-    the outline of the object seen from above, the slice at z is opaque where the underside is below z, and transparent
+
+    The object is approximated by horizontal slices at a few heights z, from its lowest to its highest point. Within the
+    outline of the object seen from above, the slice at z is opaque where the underside is below z, and transparent
     where it is above 2 z. In between, the opacity decreases linearly.
-     The share of the sky that a half-plane at the height z hides from a point is `f(d) = (1 - d / sqrt(d^2 + z^2)) /
-    2`. Here d is the horizontal distance from the point to the edge of the half-plane, and d is negative if the
-    half-plane extends over the point. A strip hides the difference of the shares of two half-planes. On a grid of about
-    30 x 30 cells, the share that one cell of a slice hides is approximated by the share of the strip over its row times
-    the share of the strip over its column, so
+
+    The share of the sky that a half-plane at the height z hides from a point is `f(d) = (1 - d / sqrt(d^2 + z^2)) / 2`.
+    Here d is the horizontal distance from the point to the edge of the half-plane, and d is negative if the half-plane
+    extends over the point. A strip hides the difference of the shares of two half-planes. On a grid of about 30 x 30
+    cells, the share that one cell of a slice hides is approximated by the share of the strip over its row times the
+    share of the strip over its column, so
 
         hidden = max_z Y_z slice_z X_z^T
-     slice_z is the opacity of the slice in each cell, times the fraction of the cell inside the outline. X_z[i, j] is
+
+    slice_z is the opacity of the slice in each cell, times the fraction of the cell inside the outline. X_z[i, j] is
     the share that a strip over column j at the height z hides from the centre of column i, and Y_z likewise for rows.
     Quadratic splines interpolate between the cells.
 
@@ -223,7 +226,8 @@ def shade(
     hidden: Float[Array, "*n"],
 ) -> Float[Array, "*n 3"]:
     """Linear light of an object as seen through the skin.
-     1. Lambert's law: `albedo * (ambient + sum_m max(0, L_m . N) c_m)`, with the normal N, and the unit direction L_m
+
+    1. Lambert's law: `albedo * (ambient + sum_m max(0, L_m . N) c_m)`, with the normal N, and the unit direction L_m
     and
        colour c_m of each light m.
     2. Contact shade: the share `crease * hidden * exp(-height / crease_height)` of this light is lost.

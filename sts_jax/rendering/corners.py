@@ -23,7 +23,8 @@ def weights(
     corners: Corners, winner: Int[Array, "h w"], column: Float[Array, "h w"], row: Float[Array, "h w"]
 ) -> tuple[list[Int[Array, "h w"]], tuple[Float[Array, "h w"], ...]]:
     """Vertex indices and barycentric weights of the three corners of the face that is visible at each pixel.
-     `winner` is the index of the visible face. A negative index, for a pixel without a face, gives the corners of face
+
+    `winner` is the index of the visible face. A negative index, for a pixel without a face, gives the corners of face
     0.
     """
     of_face = corners.faces[jnp.maximum(winner, 0)]

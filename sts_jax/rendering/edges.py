@@ -26,7 +26,8 @@ def with_moving_edges(
     The derivative here is
 
         d imprint = rate - v . grad imprint
-     Each pixel shows one point of the object. v is the motion of this point in the image (pixels), and `rate` is the
+
+    Each pixel shows one point of the object. v is the motion of this point in the image (pixels), and `rate` is the
     change of the point's depth below the undeformed surface of the gel (m). The second term is a sum over pairs of
     neighbouring pixels. For each pair, the difference of the imprint's depths at the two pixels is multiplied by the
     component of v along the line from one pixel to the other, taken at the pixel at which the object is nearer to the

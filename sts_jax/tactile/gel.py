@@ -89,7 +89,8 @@ def indent(gel: Gel, heights: Float[Array, "r c"]) -> Equilibrium:
 
 def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) -> Equilibrium:
     """Find the depth and the tilts of an object at which the pressure of the gel produces the given Fz, Mx and My.
-     Each cell of the gel is a spring. The object sinks by d, and turns by a small angle a about the x axis and b about
+
+    Each cell of the gel is a spring. The object sinks by d, and turns by a small angle a about the x axis and b about
     the y axis. Above the cell with the centre (x, y), it then has the height h' and exerts the pressure p, with the
     stiffness k:
 

@@ -27,8 +27,9 @@ Scalar = float | Array
 @dataclasses.dataclass(frozen=True)
 class Lights:
     """Any number m of directional lights inside the sensor.
-     The defaults are those of the See-Through-your-Skin paper's code: four lights in the gel's plane, one from each
-    edge of the image.
+
+    The defaults are those of the See-Through-your-Skin paper's code: four lights in the gel's plane, one from each edge
+    of the image.
     """
 
     # Directions from the skin towards the lights, sensor frame. Any length > 0. Defaults: left, right, top and bottom
@@ -137,14 +138,17 @@ def shadows(
     skin: Skin, lights: Lights | Leds, depth: Float[Array, "h w"], window: Float[Array, "4"]
 ) -> Float[Array, "m h w"]:
     """For each light and pixel, compute the share of the light that other parts of the skin do not hide.
-     Pressed parts of the skin stand out into the gel, through which the light travels, and cast shadows on the skin
+
+    Pressed parts of the skin stand out into the gel, through which the light travels, and cast shadows on the skin
     behind them. The share of a light at a point x of the skin is
 
         share = clip(1 - (atan(max_t (d(x + t u) - d(x)) / t) - e) / penumbra, 0, 1)
-     d is the depth of the skin, u the unit vector along the gel's face from x towards the light, and t the distance
+
+    d is the depth of the skin, u the unit vector along the gel's face from x towards the light, and t the distance
     along u. The arctangent is the largest elevation (rad, above the gel's plane into the gel) of the skin at the points
     x + t u. e is the elevation of the light's lower edge, and e + penumbra that of its upper edge.
-     A light in the gel's plane, as in the paper, has e = 0. It does not illuminate flat skin or the tops of pressed
+
+    A light in the gel's plane, as in the paper, has e = 0. It does not illuminate flat skin or the tops of pressed
     parts, so its shadows are visible only where one pressed part casts a shadow on a slope of another. The shadow is
     partial where the elevation of the part that casts it is below `penumbra`.
 
