@@ -9,7 +9,17 @@ from embreex.rtcore_scene import EmbreeScene
 from benchmarks.instruments.truth import body_mesh, embree, interior, public_meshes
 from sts_jax.objects.body import FACE_CLASSES, Body
 
-__all__ = ["body_mesh", "embree", "from_trimesh", "interior", "public_meshes", "rays_hidden"]
+__all__ = ["at", "body_mesh", "embree", "from_trimesh", "interior", "public_meshes", "rays_hidden", "weight"]
+
+
+def at(x, y, z, turn=(1.0, 0, 0, 0)):
+    """A pose at a position (m)."""
+    return jnp.array([x, y, z, *turn], jnp.float32)
+
+
+def weight(force, x, y):
+    """The wrench of a load (N) with the centre of pressure (x, y) (m)."""
+    return jnp.array([0.0, 0.0, force, y * force, -x * force, 0.0], jnp.float32)
 
 
 def from_trimesh(mesh: trimesh.Trimesh, *, color=(0.6, 0.4, 0.3), colors=None) -> Body:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
-from optics_bodies import body_mesh, embree, from_trimesh, interior
+from optics_bodies import at, body_mesh, embree, from_trimesh, interior, weight
 
 import sts_jax as sts
 from sts_jax import objects, sense, tactile
@@ -46,14 +46,6 @@ def ball(radius=0.03):
     """A ball of rings that are fine where it touches the gel. It has few faces and shares the letter's programs."""
     angle = np.radians([*range(0, 27, 2), 60, 120, 180])
     return from_trimesh(trimesh.creation.revolve(radius * np.stack([np.sin(angle), -np.cos(angle)], -1), sections=32))
-
-
-def weight(force, x, y):
-    return jnp.array([0.0, 0.0, force, y * force, -x * force, 0.0], jnp.float32)
-
-
-def at(x, y, z):
-    return jnp.array([x, y, z, 1.0, 0, 0, 0], jnp.float32)
 
 
 @pytest.mark.parametrize("resolution", SIZES)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
-from optics_bodies import from_trimesh
+from optics_bodies import at, from_trimesh, weight
 
 import sts_jax as sts
 from sts_jax import optics, tactile
@@ -46,14 +46,6 @@ SENSORS = {
 # Both have one size class and share a program.
 BALL = from_trimesh(trimesh.creation.icosphere(subdivisions=3, radius=0.025))
 BOX = from_trimesh(trimesh.creation.box((0.05, 0.04, 0.02)).subdivide().subdivide().subdivide().subdivide())
-
-
-def at(x, y, z, turn=(1.0, 0, 0, 0)):
-    return jnp.array([x, y, z, *turn], jnp.float32)
-
-
-def weight(force, x, y):
-    return jnp.array([0.0, 0.0, force, y * force, -x * force, 0.0], jnp.float32)
 
 
 def seen(sensor, body, pose, wrench, crop):

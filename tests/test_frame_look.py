@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
-from optics_bodies import body_mesh, from_trimesh, public_meshes
+from optics_bodies import at, body_mesh, from_trimesh, public_meshes
 from PIL import Image
 
 import sts_jax as sts
@@ -20,10 +20,6 @@ SENSOR = sts.Sensor()
 
 def with_room(**changes):
     return dataclasses.replace(SENSOR, room=dataclasses.replace(SENSOR.room, **changes))
-
-
-def at(x, y, z):
-    return jnp.array([x, y, z, 1.0, 0, 0, 0], jnp.float32)
 
 
 @pytest.mark.parametrize("resolution", [(64, 64), pytest.param((97, 53), marks=pytest.mark.slow)])

@@ -2,13 +2,11 @@
 
 import sys
 
-import jax
 import numpy as np
 import pytest
 import trimesh
 
 from sts_jax import objects
-from sts_jax.objects.hulls import outside_hull
 from sts_jax.objects.parts import convex_parts, surface_gaps
 
 pytestmark = pytest.mark.slow
@@ -104,14 +102,6 @@ def test_the_gap_of_an_open_sheet_is_measured_on_both_sides():
         assert gaps == pytest.approx((0, 0.04), rel=0.05, abs=1e-9)  # the middle of the open side
 
 
-def test_distance_from_a_hull_of_many_points_at_once():
-    rng = np.random.default_rng(0)
-    hull = trimesh.creation.box((0.2, 0.2, 0.2)).vertices
-    points = rng.uniform(-0.3, 0.3, (40_000, 3))
-    beyond = np.maximum(np.abs(points) - 0.1, 0)
-    np.testing.assert_allclose(outside_hull(points, np.asarray(hull)), np.linalg.norm(beyond, axis=1), atol=1e-9)
-
-
 def test_the_error_names_the_missing_package(monkeypatch):
     monkeypatch.setitem(sys.modules, "coacd", None)
     mesh = corner_piece()
@@ -129,14 +119,6 @@ def test_decomposition_changes_only_the_hulls(tmp_path):
         np.testing.assert_array_equal(getattr(body, name), getattr(whole, name))
     assert objects.gaps(whole)[1] == pytest.approx(0.0343, abs=5e-4)
     assert max(objects.gaps(body)) < 0.002
-
-
-def test_decomposed_scissors_leave_the_space_between_the_blades_free():
-    scissors = objects.make(jax.random.key(0), "scissors")
-    body = objects.decompose(scissors)
-    assert body.hulls.shape[0] == objects.PART_CLASSES[1]
-    assert objects.gaps(scissors)[1] > 0.02
-    assert objects.gaps(body)[1] < 0.01
 
 
 def test_a_library_decomposes_where_the_hull_is_wrong(tmp_path):

@@ -113,23 +113,6 @@ def test_depth_of_a_ball_equals_the_closed_form(radius, force):
     assert imprint.sum() * 1e-6 == pytest.approx(np.pi * (2 * radius * depth - depth**2), rel=0.05)
 
 
-# Heights and wrench are arguments, so that one program serves all cases.
-SEVERAL = jax.jit(jax.vmap(lambda height, wrench, load: tactile.settle(GEL, height, wrench * load), (None, None, 0)))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", CASES)
-def test_more_load_never_makes_the_imprint_smaller(name):
-    make, wrench = CASES[name]
-    height = jnp.asarray(make(*grid()), jnp.float32)
-    loads = jnp.linspace(0, 6, 25)[1:]
-    several = SEVERAL(height, wrench, loads)
-    cells = np.asarray(several.pressure > 0).sum((1, 2))
-    depth = np.asarray(several.pressure).max((1, 2))
-    assert np.all(np.diff(cells) >= 0)
-    assert np.all(np.diff(depth) >= -1e-3 * depth[1:])
-
-
 def deepest(got, height, gel=GEL):
     """Largest depth of the object below the gel's face (m)."""
     x, y = grid(gel)

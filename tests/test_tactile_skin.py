@@ -78,26 +78,6 @@ def test_phong_equals_the_papers_equation(shape, lights):
         )
 
 
-def test_leds_far_away_equal_far_lights():
-    lights = tactile.Lights(directions=jnp.array([[-1.0, 0.3, -0.2], [0, 1, 0], [0.2, 0.1, -1], [0.5, -0.5, -0.05]]))
-    unit = lights.directions / jnp.linalg.norm(lights.directions, axis=1, keepdims=True)
-    leds = tactile.Leds(positions=300 * unit, colors=lights.colors, falloff=2.0, reference=300.0)
-    shape = (97, 53)
-    normals, points = (jnp.asarray(v, jnp.float32) for v in (some_normals(shape), bumpy(shape)))
-    far, near = (tactile.phong(tactile.Phong(), v, normals, points) for v in (lights, leds))
-    np.testing.assert_allclose(near, far, atol=5e-3)
-    depth = jnp.asarray(pressed(shape), jnp.float32)
-    far, near = (tactile.shadows(SKIN, v, depth, jnp.asarray(WINDOW, jnp.float32)) for v in (lights, leds))
-    np.testing.assert_allclose(near, far, atol=0.02)
-    assert float(jnp.mean(far < 0.5)) > 0.05
-
-
-def test_flat_gel_has_the_colour_of_the_papers_code():
-    points = jnp.asarray(bumpy((8, 8)) * [1, 1, 0], jnp.float32)
-    image = tactile.phong(tactile.Phong(), tactile.Lights(), normals_of(points), points)
-    assert np.array_equal(np.round(np.asarray(image) * 255), np.broadcast_to([178, 178, 204], (8, 8, 3)))
-
-
 @pytest.mark.parametrize(
     "lights",
     [
@@ -209,31 +189,6 @@ def test_length_of_a_shadow_equals_height_over_tangent(near):
     assert dark.max() == pytest.approx(0.011 + height / tangent, abs=3e-4)
     assert np.all(share[x < 0.009] == 1)
     assert np.all(share[x > 0.0215] == 1)
-
-
-def test_a_bump_hides_a_light_in_the_gels_plane_from_flanks_behind_it():
-    x, y = np.meshgrid(1e-4 * np.arange(-150, 150), 1e-4 * np.arange(-50, 50))
-    bump = 0.001 * np.exp(-((x + 0.006) ** 2 + y**2) / 0.002**2)
-    second = 0.001 * np.exp(-((x - 0.006) ** 2 + y**2) / 0.002**2)
-    window = jnp.array([-0.015, -0.005, 0.03, 0.01])
-    skin = tactile.Skin(shadow_steps=64, shadow_reach=0.02, penumbra=0.02)
-
-    def red(depth):
-        """Red channel with the first light alone, which comes from the left."""
-        depth = jnp.asarray(depth, jnp.float32)
-        points = jnp.stack([jnp.asarray(x, jnp.float32), jnp.asarray(y, jnp.float32), -depth], -1)
-        lights, constants = tactile.Lights(), tactile.Phong(ambient=0.0)
-        lights = dataclasses.replace(lights, directions=lights.directions[:1], colors=lights.colors[:1])
-        normals, shares = normals_of(points), tactile.shadows(skin, lights, depth, window)
-        return [np.asarray(tactile.phong(constants, lights, normals, points, s))[..., 0] for s in (None, shares)]
-
-    open_alone, shaded_alone = red(second)
-    open_both, shaded_both = red(bump + second)
-    flank = (50, 196)  # the side of the second bump that faces the light
-    assert open_alone[flank] > 0.1
-    assert shaded_alone[flank] == open_alone[flank]  # no shadow on the second bump alone
-    assert shaded_both[flank] < 0.2 * open_both[flank]  # the first bump casts a shadow on it
-    np.testing.assert_allclose(open_both[:, 145:155], shaded_both[:, 145:155], atol=1e-3)  # flat skin is unlit
 
 
 def test_zero_steps_and_flat_skin_give_no_shadows():

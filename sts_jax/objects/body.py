@@ -57,10 +57,8 @@ class Body:
         The check needs concrete values, so it cannot run under `jit`.
         """
         if jnp.ndim(self.vertices) != 2:
-            raise ValueError(
-                f"vertices has the shape {jnp.shape(self.vertices)}, but it must be (v, 3): use jax.vmap for "
-                "stacked bodies"
-            )
+            shape = jnp.shape(self.vertices)
+            raise ValueError(f"vertices has the shape {shape}, but it must be (v, 3): use jax.vmap for stacked bodies")
         for field in dataclasses.fields(self):
             values = np.asarray(getattr(self, field.name))
             if values.dtype.kind == "f" and not np.isfinite(values).all():
@@ -73,7 +71,7 @@ class Body:
         if faces.size and not 0 <= faces.min() <= faces.max() < len(self.vertices):
             raise ValueError(
                 f"faces has indices from {faces.min()} to {faces.max()}, but with {len(self.vertices)} vertices they "
-                f"must be from 0 to {len(self.vertices) - 1}: correct the indices"
+                f"must be from 0 to {len(self.vertices) - 1}"
             )
         check_category(np.asarray(self.category).tolist())
 
@@ -139,15 +137,10 @@ def stack(bodies: Sequence[Body]) -> Body:
     for index, shape in enumerate(shapes):
         if shape != shapes[0]:
             raise ValueError(
-                f"the arrays of body {index} and body 0 have different shapes: body {index} has "
-                f"{_sizes(bodies[index])}, and body 0 has {_sizes(bodies[0])}. Stack only bodies whose arrays "
-                "have equal shapes"
+                f"the arrays of body {index} and body 0 have different shapes ({bodies[index]!r}, {bodies[0]!r}): "
+                "stack only bodies of one size class"
             )
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *bodies)
-
-
-def _sizes(body: Body) -> str:
-    return f"{len(body.faces)} faces, hulls of shape {body.hulls.shape} and a texture of side {len(body.texture)}"
 
 
 def mirror(body: Body) -> Body:

@@ -41,18 +41,9 @@ class Family:
 
 
 # Seeds never change, so that equal keys lead to equal objects in every version.
+_MODULES = (bottle, camera, webcam, mouse, scissors, fork, spoon, watch)
 FAMILIES = {
-    family.name: family
-    for family in (
-        Family("bottle", 0, bottle.parts),
-        Family("camera", 1, camera.parts),
-        Family("webcam", 2, webcam.parts),
-        Family("mouse", 3, mouse.parts),
-        Family("scissors", 4, scissors.parts),
-        Family("fork", 5, fork.parts),
-        Family("spoon", 6, spoon.parts),
-        Family("watch", 7, watch.parts),
-    )
+    name: Family(name, seed, module.parts) for seed, (name, module) in enumerate(zip(CATEGORIES, _MODULES, strict=True))
 }
 
 
@@ -67,24 +58,21 @@ def find_family(category: str) -> Family:
         return FAMILIES[category]
     module, colon, name = category.partition(":")
     if not (module and colon and name):
-        raise ValueError(
-            f"category is {category!r}, but it must be one of {', '.join(FAMILIES)}, or 'module:NAME' for a Family of "
-            "your own"
-        )
+        raise ValueError(f"category is {category!r}, but it must be one of {', '.join(FAMILIES)}, or 'module:NAME'")
     try:
-        found = getattr(importlib.import_module(module), name, None)
+        family = getattr(importlib.import_module(module), name, None)
     except ModuleNotFoundError as error:
         raise ValueError(
-            f"category is {category!r}, but the module {module} cannot be imported ({error}): install the missing "
-            "module, or start Python in the folder that contains it"
+            f"category is {category!r}, but the module {module} cannot be imported ({error}): install it, or start "
+            "Python in the folder that contains it"
         ) from error
-    if not isinstance(found, Family):
-        fault = "does not exist" if found is None else f"is of type {type(found).__name__}"
+    if not isinstance(family, Family):
+        fault = "does not exist" if family is None else f"is of type {type(family).__name__}"
         raise ValueError(
             f"category is {category!r}, but the variable {name} of the module {module} {fault}: assign an "
             f"objects.Family to {name}"
         )
-    return found
+    return family
 
 
 def make(key: PRNGKeyArray, category: str | Family) -> Body:
@@ -101,8 +89,14 @@ def make(key: PRNGKeyArray, category: str | Family) -> Body:
     family = find_family(category) if isinstance(category, str) else category
     words = np.asarray(jax.random.key_data(key)).ravel()
     parts = family.parts(np.random.default_rng([*(int(word) for word in words), family.seed]))
-    _check(family, parts)
+    try:
+        _check(parts)
+        return _assembled(parts, CATEGORIES.index(family.name) if family.name in CATEGORIES else -1)
+    except ValueError as error:
+        raise ValueError(f"family {family.name}: {error}") from error
 
+
+def _assembled(parts: list[Part], category: int) -> Body:
     first = np.cumsum([0, *(len(part.vertices) for part in parts)])
     vertices = np.concatenate([part.vertices for part in parts]) * 1e-3
     faces = np.concatenate([part.faces + offset for part, offset in zip(parts, first[:-1], strict=True)])
@@ -110,38 +104,35 @@ def make(key: PRNGKeyArray, category: str | Family) -> Body:
     density = np.concatenate([np.full(len(part.faces), part.density) for part in parts])
     inner = [part for part in parts if part.interior]
     interior = (inner[0].vertices * 1e-3, inner[0].faces) if inner else None
-    try:
-        return assemble(
-            vertices,
-            faces,
-            np.repeat(colors[:, None], 3, axis=1),
-            density=density,
-            interior=interior,
-            contents_density=CONTENTS if inner else 0.0,
-            category=CATEGORIES.index(family.name) if family.name in CATEGORIES else -1,
-        )
-    except ValueError as error:
-        raise ValueError(f"family {family.name}: {error}") from error
+    return assemble(
+        vertices,
+        faces,
+        np.repeat(colors[:, None], 3, axis=1),
+        density=density,
+        interior=interior,
+        contents_density=CONTENTS if inner else 0.0,
+        category=category,
+    )
 
 
-def _check(family: Family, parts: list[Part]) -> None:
+def _check(parts: list[Part]) -> None:
     """Raise a ValueError unless the parts form an object of an allowed size."""
     if not parts:
-        raise ValueError(f"family {family.name}: parts() must return at least one Part, got none")
+        raise ValueError("parts() must return at least one Part, got none")
     inner = sum(part.interior for part in parts)
     if inner > 1:
-        raise ValueError(f"family {family.name}: at most one part can have interior=True, got {inner}")
+        raise ValueError(f"at most one part can have interior=True, got {inner}")
     points, faces = np.concatenate([part.vertices for part in parts]), sum(len(part.faces) for part in parts)
     if max(len(points), faces) > FACE_CLASSES[-1]:
         raise ValueError(
-            f"family {family.name}: the parts of one object have {faces:,} faces and {len(points):,} vertices in "
-            f"total, but at most {FACE_CLASSES[-1]:,} of each are allowed: use fewer points in outlines and paths"
+            f"the parts of one object have {faces:,} faces and {len(points):,} vertices, but at most "
+            f"{FACE_CLASSES[-1]:,} of each are allowed: use fewer points in outlines and paths"
         )
     if not np.isfinite(points).all():
-        raise ValueError(f"family {family.name}: all vertices must be finite, got {points[~np.isfinite(points)][0]}")
+        raise ValueError(f"all vertices must be finite, got {points[~np.isfinite(points)][0]}")
     longest = float(np.ptp(points, axis=0).max())
     if not 1e3 * SMALLEST <= longest <= 1e3 * PAD:
         raise ValueError(
-            f"family {family.name}: the longest side must be {1e3 * SMALLEST:g} to {1e3 * PAD:g} mm, got {longest:.3g} "
-            "mm: give the parts in millimetres, or scale them to a length with shapes.scaled"
+            f"the longest side must be {1e3 * SMALLEST:g} to {1e3 * PAD:g} mm, got {longest:.3g} mm: give the parts in "
+            "millimetres, or scale them to a length with shapes.scaled"
         )

@@ -47,7 +47,7 @@ def find_root(folder: Path) -> Path | None:
 def items(root: Path) -> tuple[list[Item], list[tuple[str, str]]]:
     """List the models of ShapeNetSem that have a category in `CLASSES`, and (name, reason) of each skipped model."""
     rows = _rows(root / "metadata.csv")
-    found: list[Item] = []
+    usable: list[Item] = []
     skipped: list[tuple[str, str]] = []
     meshes = [root / "models-OBJ" / "models", root / "models-OBJ", root / "models"]
     textures = [root / "models-textures" / "textures", root / "models-textures", root / "textures"]
@@ -64,27 +64,22 @@ def items(root: Path) -> tuple[list[Item], list[tuple[str, str]]]:
             continue
         try:
             if name in seen:
-                raise ValueError(
-                    "this row of metadata.csv is skipped, because an earlier row describes the same model: remove this "
-                    "row or the earlier one"
-                )
+                raise ValueError("an earlier row of metadata.csv describes the same model: remove one of them")
             seen.add(name)
             if "_BAD" in categories:
                 raise ValueError("the model has the category _BAD in metadata.csv, so it is not used")
             if len(labels) > 1:
-                raise ValueError(
-                    f"the categories of the model in metadata.csv belong to several classes "
-                    f"({', '.join(sorted(labels))}): keep only the categories that belong to one class"
-                )
+                classes = ", ".join(sorted(labels))
+                raise ValueError(f"its categories in metadata.csv belong to several classes ({classes}): keep one")
             path = next((place / f"{name}.obj" for place in meshes if (place / f"{name}.obj").is_file()), None)
             if path is None:
                 raise ValueError(f"the mesh models-OBJ/models/{name}.obj does not exist: download it")
-            found.append(_item(row, path, name, labels.pop(), images))
+            usable.append(_item(row, path, name, labels.pop(), images))
         except ValueError as error:
             skipped.append((name, str(error)))
     if others:
         skipped.append(("metadata.csv", f"{others:,} of {len(rows):,} models are of none of the eight classes"))
-    return found, skipped
+    return usable, skipped
 
 
 def _rows(table: Path) -> list[dict[str, str]]:
@@ -95,7 +90,7 @@ def _rows(table: Path) -> list[dict[str, str]]:
         missing = [name for name in _COLUMNS if name not in (reader.fieldnames or ())]
         if missing:
             raise ValueError(
-                f"{table}: the table lacks columns of ShapeNetSem ({', '.join(missing)}): download the table again"
+                f"{table}: the table lacks columns of ShapeNetSem ({', '.join(missing)}): download it again"
             )
         try:
             rows = list(reader)
@@ -110,10 +105,7 @@ def _item(row: dict[str, str], path: Path, name: str, label: str, images: Path |
     """Make the item of a row, or raise a ValueError with the reason why the row cannot be used."""
     unit = row["unit"].strip()
     if not unit:
-        raise ValueError(
-            "the row of the model in metadata.csv has no unit, so the size of the mesh is unknown: write the "
-            "length of 1 mesh unit (in metres, such as 0.01) into the column `unit`"
-        )
+        raise ValueError("the row of the model in metadata.csv has no unit: write the length of 1 mesh unit (m) there")
     try:
         scale = float(unit)
     except ValueError:
@@ -138,8 +130,5 @@ def _vector(text: str, key: str) -> Vector | None:
     try:
         x, y, z = (float(part) for part in text.replace("\\", "").split(","))
     except ValueError as error:
-        raise ValueError(
-            f"the row of the model in metadata.csv has {text!r} in the column {key!r}, but this cell must contain "
-            "three numbers"
-        ) from error
+        raise ValueError(f"metadata.csv has {text!r} in the column {key!r}, but it must be three numbers") from error
     return x, y, z
