@@ -4,7 +4,7 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from sts_jax import objects
-from sts_jax._keys import check_key
+from sts_jax._checked import check_key
 from sts_jax.objects.hulls import outside_hull
 from sts_jax.objects.procedural import FAMILIES
 

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from sts_jax._keys import check_key
+from sts_jax._checked import check_key
 from sts_jax.objects.assembly import CONTENTS, assemble
 from sts_jax.objects.body import CATEGORIES, FACE_CLASSES, PAD, SMALLEST, Body
 from sts_jax.objects.families import bottle, camera, fork, mouse, scissors, spoon, watch, webcam

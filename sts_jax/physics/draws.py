@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray
 
-from sts_jax._keys import check_key
+from sts_jax._checked import check_key
 from sts_jax.objects.body import Body
 from sts_jax.physics.arguments import check_arguments, listed
 from sts_jax.physics.bodies import shapes

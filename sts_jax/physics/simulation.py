@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 from tqdm import tqdm
 
-from sts_jax._keys import check_key
+from sts_jax._checked import check_key
 from sts_jax.objects.body import Body
 from sts_jax.physics.arguments import (
     check_arguments,
