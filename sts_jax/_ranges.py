@@ -24,16 +24,16 @@ def limits(metadata: Mapping[str, Any], array: Any) -> list[tuple[Any, str]]:
     Returns:
         One pair for each limit: True if all numbers satisfy it, and a text such as "it must be > 0".
     """
-    found = []
+    conditions = []
     if "above" in metadata:
-        found.append(((array - metadata["above"] >= _SMALLEST).all(), f"it must be > {metadata['above']:g}"))
+        conditions.append(((array - metadata["above"] >= _SMALLEST).all(), f"it must be > {metadata['above']:g}"))
     if "at_least" in metadata:
-        found.append(((array >= metadata["at_least"]).all(), f"it must be >= {metadata['at_least']:g}"))
+        conditions.append(((array >= metadata["at_least"]).all(), f"it must be >= {metadata['at_least']:g}"))
     if "below" in metadata:
-        found.append(((array < metadata["below"]).all(), f"it must be < {metadata['below']:.4f}"))
+        conditions.append(((array < metadata["below"]).all(), f"it must be < {metadata['below']:.4f}"))
     if "at_most" in metadata:
-        found.append(((array <= metadata["at_most"]).all(), f"it must be <= {metadata['at_most']:g}"))
-    return found
+        conditions.append(((array <= metadata["at_most"]).all(), f"it must be <= {metadata['at_most']:g}"))
+    return conditions
 
 
 def check(config: Any) -> None:

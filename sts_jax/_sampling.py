@@ -39,9 +39,9 @@ def bilinear_batch(
     table = jnp.concatenate(corners, axis=-1).reshape(count, (height - 1) * (width - 1), 4 * channels)
     (left, x), (top, y) = _split_within(column, width), _split_within(row, height)
     index = top * (width - 1) + left
-    found = jnp.take_along_axis(table, index[..., None], axis=1).reshape(*index.shape, 4, channels)
+    neighbours = jnp.take_along_axis(table, index[..., None], axis=1).reshape(*index.shape, 4, channels)
     weights = jnp.stack([(1 - y) * (1 - x), (1 - y) * x, y * (1 - x), y * x], axis=-1)
-    return jnp.sum(weights[..., None] * found, axis=-2)
+    return jnp.sum(weights[..., None] * neighbours, axis=-2)
 
 
 def shifted(

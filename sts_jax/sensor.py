@@ -84,8 +84,8 @@ class Sensor:
             return jnp.where(sound, value, default)
 
         leaves, structure = jax.tree.flatten(self)
-        known = jax.tree.leaves(_default(self))
-        return jax.tree.unflatten(structure, [safe(*pair) for pair in zip(leaves, known, strict=True)]), sound
+        defaults = jax.tree.leaves(_default(self))
+        return jax.tree.unflatten(structure, [safe(*pair) for pair in zip(leaves, defaults, strict=True)]), sound
 
     def constants(self) -> dict[str, Any]:
         """All constants as nested dictionaries with JSON values, as in the file that `save` writes."""

@@ -265,9 +265,9 @@ def fill_moments(
     bracket = jax.lax.fori_loop(0, LEVEL_STEPS, halve, jax.lax.stop_gradient(_Bracket(bottom, top)))
     middle_level = (bracket.low + bracket.high) / 2
     # A Newton step with a constant slope gives the level the derivative of the exact root.
-    found, slope = jax.value_and_grad(lambda level: below(level).volume)(middle_level)
+    middle_volume, slope = jax.value_and_grad(lambda level: below(level).volume)(middle_level)
     wide = slope > 0
-    level = middle_level + jnp.where(wide, (target - found) / jnp.where(wide, slope, 1), 0)
+    level = middle_level + jnp.where(wide, (target - middle_volume) / jnp.where(wide, slope, 1), 0)
     # The level of a full body is above its top, so that rounding cannot exclude the highest corners.
     level = jnp.where(share < 1, level, top + (top - bottom))
     volumes, corners, reference, volume = below(level)

@@ -25,12 +25,12 @@ def references(path: Path, images: Path | None = None) -> dict[str, Path | None]
     if path.suffix.lower() == ".gltf":
         tree = json.loads(path.read_text())
         names = [part.get("uri", "data:") for key in ("buffers", "images") for part in tree.get(key, [])]
-        return {name: _found(path.parent, name, images) for name in names if not name.startswith("data:")}
+        return {name: _find(path.parent, name, images) for name in names if not name.startswith("data:")}
     if path.suffix.lower() != ".obj":
         return {}
-    files = {name: _found(path.parent, name, None) for name in _named(path, "mtllib")}
+    files = {name: _find(path.parent, name, None) for name in _named(path, "mtllib")}
     for library in [library for library in files.values() if library is not None]:
-        files |= {name: _found(path.parent, name, images) for name in _named(library, "map_kd")}
+        files |= {name: _find(path.parent, name, images) for name in _named(library, "map_kd")}
     return files
 
 
@@ -82,11 +82,11 @@ class Resolver(trimesh.resolvers.FilePathResolver):
 
     def get(self, name: str) -> bytes:
         """Return the content of the file to which the mesh file refers by `name`."""
-        found = _found(Path(self.parent), name, self.images)
-        return super().get(name) if found is None else found.read_bytes()
+        path = _find(Path(self.parent), name, self.images)
+        return super().get(name) if path is None else path.read_bytes()
 
 
-def _found(folder: Path, name: str, images: Path | None) -> Path | None:
+def _find(folder: Path, name: str, images: Path | None) -> Path | None:
     """Find a file that a mesh file in `folder` refers to: by its relative path, or by its base name in `images`."""
     name = name.strip().replace("\\", "/")
     places = [folder / name] + ([] if images is None else [images / Path(name).name])

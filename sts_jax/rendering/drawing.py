@@ -184,7 +184,7 @@ def _shade(surface: _Surface, images: tuple[Array, ...]) -> list[Float[Array, "h
     albedo = jnp.stack([color * sampled[..., k] for k, color in enumerate(inside(surface.colors))], axis=-1)
     height = depth - surface.sensor.camera.distance
     color = planes(optics.shade(surface.sensor.room, albedo, normal, height, jnp.stack(empty, axis=-1), hidden))
-    return [depth, *(jnp.where(on_pad, own, behind) for own, behind in zip(color, empty, strict=True))]
+    return [depth, *(jnp.where(on_pad, seen, behind) for seen, behind in zip(color, empty, strict=True))]
 
 
 def _imprint(

@@ -70,9 +70,9 @@ def _looped(function: Flat) -> Flat:
             return [result for result, kept in zip(function(*leaves), real, strict=True) if kept]
 
         moving = [change for change, used in zip(changes, active, strict=True) if used]
-        found = iter(_linear.bind(*leaves, *moving, function=reals, active=active, transposed=False) if moving else ())
+        rates = iter(_linear.bind(*leaves, *moving, function=reals, active=active, transposed=False) if moving else ())
         slopes = [
-            (next(found) if moving else jnp.zeros_like(result)) if kept else np.zeros(result.shape, jax.dtypes.float0)
+            (next(rates) if moving else jnp.zeros_like(result)) if kept else np.zeros(result.shape, jax.dtypes.float0)
             for result, kept in zip(results, real, strict=True)
         ]
         return results, slopes
@@ -100,8 +100,8 @@ def _over_batch(
         return jax.vmap(dense, in_axes=[0 if flag else None for flag in flags], axis_size=size)(*leaves)
 
     def one(mapped: list[Array]) -> list[Array]:
-        own = iter(mapped)
-        return single(*(next(own) if flag else leaf for leaf, flag in zip(leaves, flags, strict=True)))
+        items = iter(mapped)
+        return single(*(next(items) if flag else leaf for leaf, flag in zip(leaves, flags, strict=True)))
 
     return jax.lax.map(one, [leaf for leaf, flag in zip(leaves, flags, strict=True) if flag])
 
@@ -116,8 +116,8 @@ def _apply(*operands: ArrayLike, function: Flat, active: tuple[bool, ...], trans
     arguments, vectors = operands[: len(active)], operands[len(active) :]
 
     def of_active(*moving: Array) -> list[Array]:
-        own = iter(moving)
-        return function(*(next(own) if used else x for x, used in zip(arguments, active, strict=True)))
+        values = iter(moving)
+        return function(*(next(values) if used else x for x, used in zip(arguments, active, strict=True)))
 
     here = [x for x, used in zip(arguments, active, strict=True) if used]
     if transposed:

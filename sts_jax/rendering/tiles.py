@@ -111,7 +111,7 @@ def _sparse(
             jax.lax.dynamic_slice(first, (progress.next_tile,), (BATCH,)) for first in (first_row, first_column)
         )
         inside = jnp.arange(TILE, dtype=jnp.int32)[:, None]
-        own = (row[None, :] + inside)[:, None] * width + (column[None, :] + inside)[None, :]
+        target = (row[None, :] + inside)[:, None] * width + (column[None, :] + inside)[None, :]
 
         def take(image: Array) -> Array:
             side = jnp.arange(TILE + 2 * ring, dtype=jnp.int32)[:, None]
@@ -123,11 +123,11 @@ def _sparse(
 
         parts = jax.tree.map(take, images)
         values = function(params, parts)
-        wanted = active.reshape(-1).at[own].get(mode="promise_in_bounds")
-        own = jnp.where(wanted, own, height * width).reshape(-1)
+        wanted = active.reshape(-1).at[target].get(mode="promise_in_bounds")
+        target = jnp.where(wanted, target, height * width).reshape(-1)
 
         def put(image: Array, value: Array) -> Array:
-            return image.reshape(-1).at[own].set(value.reshape(-1), mode="drop").reshape(height, width)
+            return image.reshape(-1).at[target].set(value.reshape(-1), mode="drop").reshape(height, width)
 
         return _Progress(progress.next_tile + BATCH, jax.tree.map(put, progress.result, values))
 

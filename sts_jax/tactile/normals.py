@@ -84,9 +84,9 @@ def smallest_eigenvector(
     y = jnp.where(third, w, jnp.where(second, q, u))
     z = jnp.where(third, t, jnp.where(second, w, v))
     size = jnp.maximum(jnp.maximum(jnp.abs(x), jnp.abs(y)), jnp.abs(z))
-    known = size > 0
-    scale = 1 / jnp.where(known, size, 1)
-    x, y, z = x * scale, y * scale, jnp.where(known, z * scale, 1)
+    nonzero = size > 0
+    scale = 1 / jnp.where(nonzero, size, 1)
+    x, y, z = x * scale, y * scale, jnp.where(nonzero, z * scale, 1)
     length = 1 / jnp.sqrt(x * x + y * y + z * z)
     return x * length, y * length, z * length
 
