@@ -32,29 +32,18 @@ def test_each_category_has_a_family_whose_seed_never_changes():
 
 
 @pytest.mark.parametrize("category", objects.CATEGORIES)
-def test_a_body_fits_its_size_classes_and_the_pad(bodies, category):
+def test_a_body_fits_its_size_classes_and_the_pad_and_its_hull_consists_of_visible_vertices(bodies, category):
     for body in bodies[category]:
-        assert body.vertices.shape == (objects.FACE_CLASSES[0], 3)
-        assert body.faces.shape == (objects.FACE_CLASSES[0], 3)
-        assert body.hulls.shape[0] == 1
-        assert body.hulls.shape[1] in objects.HULL_CLASSES
+        assert body.vertices.shape == body.faces.shape == (objects.FACE_CLASSES[0], 3)
+        assert body.hulls.shape[:2] in {(1, size) for size in objects.HULL_CLASSES}
         assert body.texture.shape == (1, 1, 3)
-        longest = np.ptp(np.asarray(body.vertices), axis=0).max()
-        assert 0.050 - 1e-6 <= longest <= 0.130 + 1e-6
-        assert all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(body))
         assert objects.CATEGORIES[int(body.category)] == category
-
-
-@pytest.mark.parametrize("category", objects.CATEGORIES)
-def test_the_hull_consists_of_visible_vertices(bodies, category):
-    for body in bodies[category]:
-        outside = outside_hull(np.asarray(body.vertices, float), np.unique(np.asarray(body.hulls[0], float), axis=0))
-        assert outside.max() < 1e-4  # m: stated 0.1 mm, aim 0.2 mm
-        seen = {tuple(p) for p in np.asarray(body.vertices)}
-        assert {tuple(p) for p in np.asarray(body.hulls[0])} <= seen
-        assert {int(i) for i in np.unique(real_faces(body))} >= {
-            int(np.nonzero((np.asarray(body.vertices) == p).all(1))[0][0]) for p in np.asarray(body.hulls[0])
-        }
+        body.check()
+        vertices, hull = np.asarray(body.vertices, float), np.unique(np.asarray(body.hulls[0], float), axis=0)
+        assert 0.050 - 1e-6 <= np.ptp(vertices, axis=0).max() <= 0.130 + 1e-6
+        assert outside_hull(vertices, hull).max() < 1e-4
+        seen = vertices[np.unique(real_faces(body))]
+        assert {tuple(p) for p in hull} <= {tuple(p) for p in seen}
 
 
 @pytest.mark.parametrize("category", objects.CATEGORIES)
@@ -68,29 +57,18 @@ def test_mjx_keeps_every_corner_of_the_hull(bodies, category):
 
 
 @pytest.mark.parametrize("category", objects.CATEGORIES)
-def test_normals_point_outwards_and_colours_are_in_range(bodies, category):
+def test_normals_point_outwards_colours_are_in_range_and_the_mass_follows_from_the_area(bodies, category):
     for body in bodies[category]:
-        faces = real_faces(body)
-        vertices = np.asarray(body.vertices, float)
-        normals = np.asarray(body.normals, float)
+        faces, normals, colors = real_faces(body), np.asarray(body.normals, float), np.asarray(body.colors)
         np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1, atol=1e-5)
-        a, b, c = np.moveaxis(vertices[faces], 1, 0)
+        a, b, c = np.moveaxis(np.asarray(body.vertices, float)[faces], 1, 0)
         flat = np.cross(b - a, c - a)
         assert (np.einsum("fki,fi->fk", normals[: len(faces)], flat) > 0).all()
-        colors = np.asarray(body.colors)
-        assert colors.min() >= 0
-        assert colors.max() <= 1
+        assert 0 <= colors.min() <= colors.max() <= 1
         different = len(np.unique(colors[: len(faces)].reshape(-1, 3), axis=0))
         assert different >= (1 if category == "fork" else 2)  # a fork may be all steel
-
-
-@pytest.mark.parametrize("category", objects.CATEGORIES)
-def test_the_mass_follows_from_the_area_of_the_surface(bodies, category):
-    for body in bodies[category]:
-        triangles = np.asarray(body.vertices, float)[real_faces(body)]
-        area = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
-        lightest, heaviest = (0.8, 1.2 + 1e-6) if category not in (*SOLID, "watch") else (0.8, 5.9 + 1e-6)
-        assert lightest < float(body.shell_mass) / (area.sum() / 2) < heaviest
+        heaviest = 5.9 if category in (*SOLID, "watch") else 1.2
+        assert 0.8 < float(body.shell_mass) / (np.linalg.norm(flat, axis=1).sum() / 2) < heaviest + 1e-6
         moments = np.linalg.eigvalsh(np.asarray(body.shell_inertia, float))
         assert moments[0] > 0
         assert moments[0] + moments[1] > moments[2] * (1 - 1e-5)
