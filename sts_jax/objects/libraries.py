@@ -82,7 +82,10 @@ def library(
     folder = Path(folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder of objects: check the path")
-    check_settings(folder, longest_side=longest_side, scale=scale, largest=largest, faces=faces)
+    try:
+        check_settings(longest_side=longest_side, scale=scale, largest=largest, faces=faces)
+    except ValueError as error:
+        raise ValueError(f"{folder}: {error}") from None
     if up is not None and up not in AXES:
         raise ValueError(f"{folder}: up must be 'x', 'y' or 'z', got {up!r}")
     root = shapenet.find_root(folder)

@@ -120,7 +120,7 @@ def albedo(path: Path, pieces: list[trimesh.Trimesh]) -> tuple[np.ndarray, np.nd
     try:
         sheets = [np.asarray(picture.convert("RGB")) for picture in pictures]
     except (OSError, SyntaxError) as error:
-        raise ValueError(f"{path}: a texture of the mesh cannot be read ({error}): replace the texture") from error
+        raise ValueError(f"a texture of the mesh cannot be read ({error}): replace the texture") from error
     distinct: list[np.ndarray] = []
     cell = []
     for sheet in sheets:

@@ -107,23 +107,23 @@ def load(
         category: Index into CATEGORIES, or -1 for an object of no category.
     """
     path = Path(path)
-    check_settings(path, longest_side=longest_side, scale=scale, largest=largest, faces=faces)
-    check_positive(path, "mass", mass, "kilograms")
-    check_positive(path, "density", density, "kilograms per square metre")
-    check_category(category)
-    turn = _attitude(path, up, front)
-    check_file(path)
-    images = None if textures is None else Path(textures)
-    if texture is None:
-        check_materials(path, images, strict)
-    pieces = _read(path, images)
-    corners = checked_corners(path, pieces, faces) @ turn.T
-    if texture is not None:
-        _wear(path, pieces, Path(texture))
-    surface = merge(path, corners * _factor(path, corners, longest_side, scale, largest), *albedo(path, pieces))
-    if faces is not None and max(len(surface.faces), len(surface.vertices)) > faces:
-        surface = decimate(path, surface, faces)
     try:
+        check_settings(longest_side=longest_side, scale=scale, largest=largest, faces=faces)
+        check_positive("mass", mass, "kilograms")
+        check_positive("density", density, "kilograms per square metre")
+        check_category(category)
+        turn = _attitude(up, front)
+        check_file(path)
+        images = None if textures is None else Path(textures)
+        if texture is None:
+            check_materials(path, images, strict)
+        pieces = _read(path, images)
+        corners = checked_corners(pieces, faces) @ turn.T
+        if texture is not None:
+            _wear(pieces, Path(texture))
+        surface = merge(corners * _factor(path, corners, longest_side, scale, largest), *albedo(path, pieces))
+        if faces is not None and max(len(surface.faces), len(surface.vertices)) > faces:
+            surface = decimate(path, surface, faces)
         body = _body(path, surface, mass, density, hollow, strict, category)
         return decompose(body) if parts else body
     except ValueError as error:
@@ -131,20 +131,17 @@ def load(
 
 
 def _attitude(
-    path: Path, up: Literal["x", "y", "z"] | tuple[float, float, float], front: tuple[float, float, float] | None
+    up: Literal["x", "y", "z"] | tuple[float, float, float], front: tuple[float, float, float] | None
 ) -> np.ndarray:
     """Return the rotation matrix for the arguments `up` and `front` of `load`."""
-    if isinstance(up, str):
-        if up not in AXES or front is not None:
-            raise ValueError(
-                f"{path}: `up` is {up!r} and `front` is {front}, but this combination is not allowed: pass 'x', 'y' or "
-                "'z' as `up` and omit `front`, or pass a direction of three numbers as `up`, with or without `front`"
-            )
-        return rotation(*AXES[up])
-    try:
+    if not isinstance(up, str):
         return rotation(up, AXES["z"][1] if front is None else front)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    if up not in AXES or front is not None:
+        raise ValueError(
+            f"up is {up!r} and front is {front}: give 'x', 'y' or 'z' as `up` and omit `front`, or give a direction of "
+            "three numbers as `up`"
+        )
+    return rotation(*AXES[up])
 
 
 def _read(path: Path, images: Path | None) -> list[trimesh.Trimesh]:
@@ -158,22 +155,19 @@ def _read(path: Path, images: Path | None) -> list[trimesh.Trimesh]:
         # For text that is not UTF-8, trimesh imports a package that is not one of its requirements.
         install = f"install the package {error.name}"
         remedy = "the file is truncated or damaged: replace it" if error.name == "charset_normalizer" else install
-        raise ValueError(f"{path}: the file cannot be read as a mesh ({error}): {remedy}") from error
+        raise ValueError(f"the file cannot be read as a mesh ({error}): {remedy}") from error
     except Exception as error:  # trimesh's many readers raise errors of many types
         raise ValueError(
-            f"{path}: the file cannot be read as a mesh ({error}): check that it is complete and has the right suffix"
+            f"the file cannot be read as a mesh ({error}): check that it is complete and has the right suffix"
         ) from error
 
 
-def _wear(path: Path, pieces: list[trimesh.Trimesh], texture: Path) -> None:
+def _wear(pieces: list[trimesh.Trimesh], texture: Path) -> None:
     """Replace the textures of meshes by an image."""
     material = trimesh.visual.material.PBRMaterial(baseColorTexture=read_image(texture))
     for piece in pieces:
         if getattr(piece.visual, "uv", None) is None:
-            raise ValueError(
-                f"{path}: the mesh has no texture coordinates, so {texture} cannot be applied to it: omit the argument "
-                "texture"
-            )
+            raise ValueError(f"the mesh has no texture coordinates for {texture}: omit the argument texture")
         piece.visual = trimesh.visual.TextureVisuals(uv=piece.visual.uv, material=material)
 
 
@@ -188,7 +182,7 @@ def _factor(
     extent *= factor
     if extent < SMALLEST:
         raise ValueError(
-            f"{path}: the longest side is {extent * 1e3:.2g} mm, but it must be at least {SMALLEST * 1e3:g} mm: check "
+            f"the longest side is {extent * 1e3:.2g} mm, but it must be at least {SMALLEST * 1e3:g} mm: check "
             "the unit of the file, and give longest_side (in metres), or give scale (in metres per unit)"
         )
     if largest is not None and extent > largest:
@@ -196,9 +190,8 @@ def _factor(
         return factor * largest / extent
     if extent > PAD:
         raise ValueError(
-            f"{path}: the longest side is {extent:.3g} m, but it must be at most {PAD} m, the width of the sensor's "
-            "pad: give longest_side (in metres), or give scale (in metres per unit, 0.001 if the file is in "
-            "millimetres)"
+            f"the longest side is {extent:.3g} m, but it must be at most {PAD} m, the width of the sensor's pad: give "
+            "longest_side (in metres), or give scale (in metres per unit, 0.001 if the file is in millimetres)"
         )
     return factor
 

@@ -19,11 +19,10 @@ class Surface(NamedTuple):
     texture: np.ndarray | None  # (t, t, 3), texture in linear light, [0, 1], or None
 
 
-def merge(path: Path, corners: np.ndarray, colors: np.ndarray, uv: np.ndarray, texture: np.ndarray | None) -> Surface:
+def merge(corners: np.ndarray, colors: np.ndarray, uv: np.ndarray, texture: np.ndarray | None) -> Surface:
     """Make a surface from separate faces. Corners at the same place become one vertex (see `proper`).
 
     Args:
-        path: Path of the mesh file, for error messages.
         corners: Corners of each face, (f, 3, 3) (m).
         colors: Colour at each corner, (f, 3, 3), in linear light.
         uv: Texture coordinates at each corner, (f, 3, 2).
@@ -33,17 +32,16 @@ def merge(path: Path, corners: np.ndarray, colors: np.ndarray, uv: np.ndarray, t
     _, first, index = np.unique(
         np.round(corners.reshape(-1, 3) / grain), axis=0, return_index=True, return_inverse=True
     )
-    return proper(path, Surface(corners.reshape(-1, 3)[first], index.reshape(-1, 3), colors, uv, texture))
+    return proper(Surface(corners.reshape(-1, 3)[first], index.reshape(-1, 3), colors, uv, texture))
 
 
-def proper(path: Path, surface: Surface) -> Surface:
+def proper(surface: Surface) -> Surface:
     """Remove faces that use a vertex twice, and vertices that no face uses. At least one face must remain."""
     faces = surface.faces
     kept = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
     if not kept.any():
         raise ValueError(
-            f"{path}: every face has two corners at the same place and therefore no area: give a mesh whose faces have "
-            "three different corners"
+            "every face has two corners at the same place: give a mesh whose faces have three different corners"
         )
     used, faces = np.unique(faces[kept], return_inverse=True)
     return surface._replace(
@@ -102,14 +100,14 @@ def decimate(path: Path, surface: Surface, target: int) -> Surface:
             break
     else:
         raise ValueError(
-            f"{path}: the mesh of {len(surface.faces):,} faces cannot be decimated to {target:,} faces, because it "
+            f"the mesh of {len(surface.faces):,} faces cannot be decimated to {target:,} faces, because it "
             "consists of too many separate parts: allow more faces (argument faces)"
         )
     note = "" if surface.texture is None else ", and its texture replaced by one colour per corner of each face"
     warnings.warn(f"{path}: decimated from {len(surface.faces):,} to {len(faces):,} faces{note}", stacklevel=3)
     vertices, faces = np.asarray(vertices, float), np.asarray(faces, int)
     colors = _sampled(surface, vertices[faces], 20 * target)
-    return proper(path, Surface(vertices, faces, colors, np.zeros((len(faces), 3, 2)), None))
+    return proper(Surface(vertices, faces, colors, np.zeros((len(faces), 3, 2)), None))
 
 
 def _sampled(surface: Surface, corners: np.ndarray, num: int) -> np.ndarray:
