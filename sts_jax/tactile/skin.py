@@ -96,12 +96,9 @@ class Phong:
 
     # Reflectance k_a of ambient light. Source of this and the next three: paper, supplement "Simulator Details".
     ambient: Scalar = dataclasses.field(default=0.8, metadata=NOT_NEGATIVE)
-    # Diffuse reflectance k_d.
-    diffuse: Scalar = dataclasses.field(default=1.0, metadata=NOT_NEGATIVE)
-    # Specular reflectance k_s.
-    specular: Scalar = dataclasses.field(default=0.5, metadata=NOT_NEGATIVE)
-    # Exponent alpha of the specular reflection.
-    shininess: Scalar = dataclasses.field(default=5.0, metadata=POSITIVE)
+    diffuse: Scalar = dataclasses.field(default=1.0, metadata=NOT_NEGATIVE)  # Diffuse reflectance k_d.
+    specular: Scalar = dataclasses.field(default=0.5, metadata=NOT_NEGATIVE)  # Specular reflectance k_s.
+    shininess: Scalar = dataclasses.field(default=5.0, metadata=POSITIVE)  # Exponent alpha of the specular reflection.
     # Ambient light i_a in the red, green and blue channel. With the default, a flat gel has the colour
     # (178, 178, 204) / 255.
     ambient_color: tuple[Scalar, Scalar, Scalar] = dataclasses.field(
