@@ -239,13 +239,9 @@ def test_the_lens_is_fitted_from_a_folder(tmp_path, pictures, capsys):
     assert printed.count("corners, error 0.") == len(POSES)
 
 
-def test_boards_that_do_not_reach_the_corners_are_refused(tmp_path, pictures):
+def test_a_view_that_the_camera_does_not_see_is_refused(config):
     with pytest.raises(hardware.CalibrationError, match=r"corners of the sensor's view are up to 5\d"):
         hardware.check_view(TRUE, PINHOLE, math.radians(40))
-    hardware.check_view(TRUE, PINHOLE, hardware.view_angle(TRUE, PINHOLE))
-
-
-def test_a_view_that_the_camera_does_not_see_is_refused(config):
     shifted = dataclasses.replace(hardware.Lens.ideal(WIDTH, HEIGHT), cx=60.0)
     with pytest.raises(hardware.CalibrationError, match=r"\d% of .*middle left.* outside .*centre of the pad"):
         hardware.check_view(shifted, PINHOLE)
@@ -428,12 +424,6 @@ def test_devices_are_listed_with_the_next_command(config, monkeypatch, capsys):
     monkeypatch.setattr(hardware, "find_sensors", lambda: hardware.FoundSensors([camera], []))
     with pytest.raises(ValueError, match="no USB serial port was found: connect the controller"):
         commission.main(dataclasses.replace(config, leds=None))
-
-
-def test_the_board_is_printed(tmp_path, capsys):
-    commission.main(commission.Config(print_board=tmp_path / "board.pdf"))
-    assert (tmp_path / "board.pdf").read_bytes().startswith(b"%PDF")
-    assert "100 mm" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

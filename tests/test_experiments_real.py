@@ -126,15 +126,6 @@ def sensor_file(peer, path):
     return path
 
 
-def test_a_file_of_another_sensor_is_refused(peer, tmp_path):
-    peer.leds.controller._serial_number = "OTHER"
-    file = sensor_file(peer, tmp_path / "sensor.json")
-    peer.leds.controller._serial_number = "EMULATED"
-    options = real.Collect(tmp_path, leds=peer.path, sensor=file, lock=False, headless=True, automatic=True)
-    with pytest.raises(SystemExit, match="LED controller OTHER, but the connected sensor has LED controller EMULATED"):
-        real.main(options)
-
-
 def ask(page, method, path, body=None, **headers):
     connection = http.client.HTTPConnection(page.host, page.port, timeout=WAIT_S)
     try:
@@ -261,14 +252,6 @@ def test_lines_of_a_pipe_act_like_keys(monkeypatch):
         os.write(sender, b"x\n")
         assert keys.action() is None
         os.close(sender)
-        assert keys.action() is Action.STOP
-
-
-def test_the_end_of_the_input_stops(monkeypatch):
-    with open(os.devnull) as nothing:
-        monkeypatch.setattr(sys, "stdin", nothing)
-        keys = Terminal()
-        keys.show(view())
         assert keys.action() is Action.STOP
 
 

@@ -99,15 +99,6 @@ def test_the_object_lies_at_the_configured_place(box):
     assert np.ptp(corners(dataclasses.replace(config, tilt=(10.0, 0.0), turn=0.0))[0][:, 2]) == pytest.approx(height)
 
 
-def test_a_round_object_keeps_the_orientation_of_its_file(tmp_path):
-    path = tmp_path / "ball.stl"
-    trimesh.creation.icosphere(subdivisions=3, radius=0.02).export(path)
-    config = sense.Config(str(path))
-    pose, _, words = laying.lay(config, sts.Sensor(), laying.read(config, str(path)))
-    assert pose[2] == pytest.approx(0.02, rel=0.01)
-    assert "that it can rest on" in words
-
-
 def test_a_sheet_shows_all_classes(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sts.objects, "CATEGORIES", ("fork", "watch"))
     out = tmp_path / "classes.png"
@@ -136,20 +127,12 @@ def test_a_sensor_of_a_file_is_used(box, tmp_path):
     ("changes", "message"),
     [
         ({"mesh": "teapot"}, r"teapot is neither a file nor an object class \(bottle, camera"),
-        ({"mesh": "teapot.obj"}, r"teapot\.obj: no such mesh file"),
         ({"resolution": (0, 64)}, r"resolution is \(0, 64\).*at least 1 pixel"),
         ({"mass": 0.0}, "mass is 0.0, but it must be > 0"),
-        ({"mass": np.nan}, "mass is nan, but it must be finite"),
         ({"force": -1.0}, "--force is -1.0, but it must be >= 0"),
-        ({"position": (0.0, np.inf)}, "position is .*finite"),
         ({"light": 1.5}, "light is 1.5"),
         ({"rest": 99}, r"--rest is 99, but it must be the index of a face .* can rest, from 0 to \d+"),
         ({"mesh": "bottle", "longest_side": 0.1}, "--longest-side is for mesh files, but bottle is an object class"),
-        ({"longest_side": 0.2}, "longest_side is 0.2 m, but the sensor's pad is 0.15 m wide"),
-        ({"scale": 100.0}, r"longest side is 4 m, but it must be at most 0.15 m, .* pad: give longest_side"),
-        ({"out": "nowhere/a.png"}, "the folder nowhere of a.png does not exist"),
-        ({"out": "."}, "is a folder: give the name of a picture"),
-        ({"out": "a.xyz"}, r"a\.xyz has the suffix '\.xyz', but it must be one of \.png"),
         ({"sensor": "none.json"}, r"none\.json"),
     ],
 )
@@ -160,16 +143,3 @@ def test_an_invalid_option_is_refused_before_a_picture_is_written(box, tmp_path,
     with pytest.raises((ValueError, OSError), match=message):
         sense.main(config)
     assert not (tmp_path / "a.png").exists()
-
-
-def test_broken_meshes_are_refused_and_large_ones_are_decimated(tmp_path):
-    bad = trimesh.creation.box((0.04, 0.03, 0.02))
-    bad.vertices[3] = np.nan
-    (tmp_path / "nan.obj").write_text(trimesh.exchange.obj.export_obj(bad))
-    with pytest.raises(ValueError, match=r"nan\.obj.*NaN"):
-        sense.main(sense.Config(str(tmp_path / "nan.obj"), out=tmp_path / "a.png"))
-    record = np.zeros(1_000_000, [("numbers", "<f4", 12), ("attribute", "<u2")])
-    record["numbers"][:, 3:] = np.random.default_rng(0).uniform(0, 0.1, (1_000_000, 9))
-    (tmp_path / "many.stl").write_bytes(bytes(80) + np.uint32(1_000_000).tobytes() + record.tobytes())
-    with pytest.raises(ValueError, match=r"many\.stl: the mesh has 1,000,000 faces, but at most 131,072 can be drawn"):
-        sense.main(sense.Config(str(tmp_path / "many.stl"), out=tmp_path / "a.png"))

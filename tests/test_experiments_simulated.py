@@ -87,7 +87,6 @@ def test_the_sensor_file_of_the_twin_rectifies_to_the_simulated_view(tmp_path):
     ("options", "message"),
     [
         ({"camera": "/dev/video0"}, "--camera is /dev/video0, but no device is used with --twin: leave out --camera"),
-        ({"leds": "/dev/ttyACM0"}, "--leds is /dev/ttyACM0"),
         ({"lock": False}, r"--no-lock has no effect on the digital twin \(--twin\): leave out"),
         ({"levels": (0, 0, 0, 256)}, r"levels must be four integers from 0 to 255, .* got \(0, 0, 0, 256\)"),
         ({"count": 0}, "count must be >= 1, got 0"),

@@ -75,15 +75,8 @@ def draw(
 ) -> list[Path]:
     """Draw the main model's predictions, the calibration of its outcomes, and its sampled positions at rest.
 
-    Args:
-        run: The split of the experiment.
-        test: Held-out trajectories.
-        scores: Scores of the predictions, by the titles of the tables' rows.
-        shown: Predictions of the first held-out trajectories, by the same titles.
-        rerolled: Poses at rest of the re-rolls of the first held-out trajectories, shape (times, n, 7).
-
-    Returns:
-        Paths of the figures.
+    `scores` and `shown`, the first predictions, have the titles of the tables' rows as keys. `rerolled` are poses at
+    rest of re-rolls of the first held-out trajectories, shape (times, n, 7). The result is the paths of the figures.
     """
     config, name = run.config, run.workdir.name
     drawn, model = [], TITLES[run.main_model]
@@ -151,16 +144,7 @@ def views(body: sts.objects.Body, pose: np.ndarray, gravity: np.ndarray, sensor:
     """Render the object and the pad obliquely from above, for each frame of a trajectory.
 
     The final direction of gravity points down in the pictures. An object that has left the pad is drawn while it moves.
-
-    Args:
-        body: The object.
-        pose: Poses, shape (frames, 7).
-        gravity: Gravity in the sensor frame (m/s^2), shape (frames, 3).
-        sensor: Sensor, whose pad is drawn.
-        wall: Height of the stop wall (m), 0 for none.
-
-    Returns:
-        Pictures of shape (frames, height, width, 3) in [0, 1].
+    `pose` has the shape (frames, 7), `gravity` (frames, 3), the result (frames, height, width, 3) in [0, 1].
     """
     size, up = jnp.array(sensor.gel.size), -jnp.asarray(gravity[-1])
     frozen = np.append(False, (pose[1:] == pose[:-1]).all(1)) & np.asarray(sts.physics.fell_off(jnp.asarray(pose)))

@@ -69,13 +69,7 @@ class Args:
 
 
 def command(presets: Mapping[str, Config], workdir: str, description: str | None) -> None:
-    """Run an experiment from the command line.
-
-    Args:
-        presets: Configurations by name, with `default` among them.
-        workdir: Default of `--workdir`.
-        description: Text for `--help`.
-    """
+    """Run an experiment from the command line, with the presets by name and the default of `--workdir`."""
     args = parse(presets, workdir, description)
     with on_one_line(debug=args.debug):
         sts.enable_compilation_cache()
@@ -260,13 +254,8 @@ def jobs(
 ) -> Iterator[Job]:
     """Prepare the trainings of an experiment, one after the other.
 
-    Args:
-        config: Configuration of the experiment.
-        sensor: Sensor of the collection.
-        pairs: First and last frames of the training trajectories.
-        views: Views of the training objects, which only the state-space model uses.
-        falls: First and last poses of trajectories without images, which only the state-space model uses.
-        measurements: Further modalities of the paper's model `mvae`, whose values `pairs.measurements` has.
+    Only the state-space model uses `views` and `falls` (ends of trajectories without images), and only the paper's
+    model `mvae` uses `measurements`.
     """
     scenario = config.collection.scenario
     frame = dataset.empty_frame(sensor, config.collection)
@@ -327,15 +316,7 @@ def train_model(
     own: Extensions = NONE,
     progress: Callable[[int, int, dict[str, float]], None] | None = None,
 ) -> None:
-    """Train a model in a folder, or continue an interrupted training.
-
-    Args:
-        job: Model and data.
-        folder: Folder of the model.
-        targets: `Config.targets`.
-        own: Your own loss, optimiser and logger.
-        progress: As in `training.train`. None: show a progress bar.
-    """
+    """Train a model in a folder, or continue an interrupted training. Without `progress`, a bar is shown."""
     with Bar() as bar:
 
         def show(done: int, total: int, record: dict[str, float]) -> None:
