@@ -4,7 +4,6 @@ import contextlib
 import http.client
 import json
 import os
-import pty
 import queue
 import subprocess
 import sys
@@ -23,7 +22,7 @@ from benchmarks.instruments.peers import DARK, LIT, SIZE, SensorPeer
 from experiments import real
 from experiments.shared.collecting import person
 from experiments.shared.page import CollectPage
-from experiments.shared.terminal import Terminal, single_keys
+from experiments.shared.terminal import Terminal
 from sts_jax import hardware
 from sts_jax.hardware import Action, Stage
 
@@ -221,38 +220,23 @@ def test_the_page_states_where_it_listens(capsys):
         assert f"listens on {host}, so {text}" in capsys.readouterr().err
 
 
-def test_keys_of_a_terminal(monkeypatch, capsys):
-    master, slave = pty.openpty()
-    with os.fdopen(slave) as terminal:
-        monkeypatch.setattr(sys, "stdin", terminal)
-        keys = Terminal(7)
-        with single_keys():
-            keys.show(view(Stage.HOLD))
-            os.write(master, b"\n")
-            keys.show(view(Stage.RELEASE))
-            assert keys.action() is None  # it was pressed in another stage
-            keys.show(view(Stage.RELEASE))
-            for key, expected in ((b"x\n", Action.CONFIRM), (b"D", Action.DISCARD), (b"q", Action.STOP)):
-                os.write(master, key)
-                assert keys.action() is expected
-            assert keys.action() is None
-    os.close(master)
-    assert "[4 of 7] trajectory 0: Do." in capsys.readouterr().err
-
-
-def test_lines_of_a_pipe_act_like_keys(monkeypatch):
+def test_lines_act_in_the_stage_that_the_person_has_seen(monkeypatch, capsys):
     receiver, sender = os.pipe()
     with os.fdopen(receiver) as pipe:
         monkeypatch.setattr(sys, "stdin", pipe)
-        keys = Terminal()
-        keys.show(view())
-        keys.show(view())
+        terminal = Terminal(7)
+        terminal.show(view(Stage.HOLD))
+        os.write(sender, b"\n")
+        terminal.show(view(Stage.RELEASE))
+        assert terminal.action() is None  # it was written in another stage
+        terminal.show(view(Stage.RELEASE))
         os.write(sender, b"help\n\r\nD\nq\n")
-        assert [keys.action() for _ in range(3)] == [Action.CONFIRM, Action.DISCARD, Action.STOP]
+        assert [terminal.action() for _ in range(3)] == [Action.CONFIRM, Action.DISCARD, Action.STOP]
         os.write(sender, b"x\n")
-        assert keys.action() is None
+        assert terminal.action() is None
         os.close(sender)
-        assert keys.action() is Action.STOP
+        assert terminal.action() is Action.STOP
+    assert "[4 of 7] trajectory 0: Do." in capsys.readouterr().err
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from experiments.shared import drawing
 from experiments.shared.device import Simulated, simulate
 from experiments.shared.page import CollectPage
 from experiments.shared.run import Folder
-from experiments.shared.terminal import Terminal, say, single_keys
+from experiments.shared.terminal import Terminal, say
 from sts_jax import hardware, storage
 from sts_jax.hardware import AutomaticPerson, EmptyPad, GuideConfig, Person, View
 
@@ -172,21 +172,20 @@ def keep(file: Path, workdir: Path) -> None:
 def person(config: Collect) -> Iterator[Person]:
     """The terminal or the page that shows instructions to a person and receives the person's actions."""
     if config.headless:
-        with single_keys():
-            terminal = Terminal(config.count, keys=not config.automatic)
-            yield Automatic(terminal, actions=False) if config.automatic else terminal
+        terminal = Terminal(config.count, listens=not config.automatic)
+        yield Automatic(terminal) if config.automatic else terminal
         return
     with contextlib.closing(CollectPage(config.host, config.port, count=config.count)) as page:
         page.announce("watch and press the buttons")
-        yield Automatic(page, actions=True) if config.automatic else page
+        yield Automatic(page) if config.automatic else page
 
 
 class Automatic(AutomaticPerson):
-    """Shows the views of another person, and confirms every trajectory. The other person can still act, if asked."""
+    """Confirms every trajectory, and shows the views to another person, who can also act."""
 
-    def __init__(self, other: Person, *, actions: bool):
+    def __init__(self, other: Person):
         super().__init__()
-        self._other, self._actions = other, actions
+        self._other = other
 
     def show(self, view: View) -> None:
         """Show a view to both."""
@@ -195,7 +194,7 @@ class Automatic(AutomaticPerson):
 
     def action(self) -> hardware.Action | None:
         """The action of the other person, or the automatic one."""
-        return (self._other.action() if self._actions else None) or super().action()
+        return self._other.action() or super().action()
 
 
 def review(config: Review) -> None:

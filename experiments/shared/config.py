@@ -1,7 +1,6 @@
 """The configuration of an experiment, its presets, its checks, and one split of it in a work directory."""
 
 import dataclasses
-import itertools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -286,36 +285,23 @@ def check(config: Config, own: Extensions = NONE) -> None:
 
 def _check_parts(collection: dataset.Collection, split: str) -> None:
     """Raise a `ValueError` unless each part of a split has at least one object or trajectory."""
-    shares, count = np.array(collection.shares), collection.num_objects
+    shares, count, items = np.array(collection.shares), collection.num_objects, "objects"
     parts: tuple[str, ...] = PARTS
-    items, few = "objects", f"collection.num_objects is {count}"
     if split == "trajectory":
         rest = evaluation.train_share(collection.shares, split)
-        shares, count = np.array([rest, 1 - rest]), count * collection.rendered_per_object
-        parts, items = ("train", "test"), "trajectories"
-        few = f"the number of trajectories with images is {count}"
-    empty = [name for name, size in zip(parts, _sizes(shares, count), strict=True) if size < 1]
-    if not empty:
+        shares, count, items = np.array([rest, 1 - rest]), count * collection.rendered_per_object, "trajectories"
+        parts = ("train", "test")
+    sizes = np.diff(np.round(np.cumsum([0, *shares]) * count)).astype(int)
+    if min(sizes) >= 1:
         return
-    if min(shares) <= 0:
-        raise ValueError(
-            f"collection.shares must be > 0 for {', '.join(parts)}, got {collection.shares}: give "
-            "--collection.shares 0.7 0.1 0.2, for example"
-        )
-    least = next(n for n in itertools.count(count + 1) if min(_sizes(shares, n)) >= 1)
     more = "raise --collection.num-objects"
     if collection.meshes is not None:
         more = "add usable objects to the folder (objects.txt in the work directory lists the unusable ones)"
     raise ValueError(
-        f"{few}, so the part {empty[0]!r} of the split by {split} has no {items}. With collection.shares "
-        f"{collection.shares}, at least {least} {items} are needed: {more}, or give other --collection.shares, such as "
-        "0.7 0.1 0.2"
+        f"the part {parts[sizes.argmin()]!r} of the split by {split} is empty: there are {count} {items}, and "
+        f"collection.shares is {collection.shares}. To get at least one item in each part, {more}, or give other "
+        "--collection.shares, such as 0.7 0.1 0.2"
     )
-
-
-def _sizes(shares: np.ndarray, count: int) -> np.ndarray:
-    """The numbers of items in the parts of a split of `count` items."""
-    return np.diff(np.round(np.cumsum([0, *shares]) * count)).astype(int)
 
 
 def image_sizes(config: Config) -> tuple[int, ...]:

@@ -1,7 +1,6 @@
 """Options that describe an object on the pad, and functions that load the object and lay it there."""
 
 import dataclasses
-import math
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -53,17 +52,6 @@ def check(config: Config) -> None:
     """Check the options before any work."""
     if min(config.resolution) < 1:
         raise ValueError(f"--resolution is {config.resolution}, but height and width must be at least 1 pixel")
-    numbers = {
-        "position": config.position,
-        "height": (config.height,),
-        "turn": (config.turn,),
-        "tilt": config.tilt,
-        "force": (config.force or 0.0,),
-        "mass": (1.0 if config.mass is None else config.mass,),
-    }
-    for name, values in numbers.items():
-        if not all(math.isfinite(value) for value in values):
-            raise ValueError(f"--{name} is {getattr(config, name)}, but it must be finite")
     for name, value in (("mass", config.mass), ("force", config.force)):
         if value is not None and (value < 0 or (name == "mass" and value == 0)):
             raise ValueError(f"--{name} is {value}, but it must be " + (">= 0 (N)" if name == "force" else "> 0 (kg)"))

@@ -1,4 +1,4 @@
-"""What a command says: progress, errors and warnings on one line, and the instructions and keys of a collection."""
+"""What a command says: progress, errors and warnings on one line, and the instructions of a collection."""
 
 import contextlib
 import os
@@ -26,7 +26,7 @@ CORRECTABLE = (
     hardware.CameraError,
     hardware.LightError,
 )
-KEYS = {"\n": Action.CONFIRM, "\r": Action.CONFIRM, "d": Action.DISCARD, "q": Action.STOP}
+LINES = {"": Action.CONFIRM, "d": Action.DISCARD, "q": Action.STOP}
 _EVERY_S = 10.0  # time between two lines of progress where standard error is not a terminal (s)
 
 
@@ -97,18 +97,19 @@ def interrupt_on_sigterm() -> None:
 
 
 class Terminal:
-    """A `hardware.Person` at a terminal: Enter confirms, d discards the trajectory, q stops.
+    """A `hardware.Person` at a terminal: an empty line confirms, `d` discards the trajectory, `q` stops.
 
-    If the standard input is not a terminal, each line acts like a key, an empty line like Enter, and its end like q.
+    The end of the input stops too.
     """
 
-    def __init__(self, count: int | None = None, *, keys: bool = True):
-        """Explain the keys, unless `keys` is False. `count` is the number of trajectories to reach, if there is one."""
+    def __init__(self, count: int | None = None, *, listens: bool = True):
+        """Explain the keys, unless nobody listens to them. `count` is the number of trajectories to reach, if any."""
         self._goal = "" if count is None else f" of {count}"
+        self._listens = listens
         self._shown: object = None
         self._stages: tuple[Stage | None, Stage | None] = (None, None)  # stages of the last two views
-        if keys:
-            say("Enter confirms, d discards, q stops")
+        if listens:
+            say("Enter confirms, d and Enter discard, q and Enter stop")
 
     def show(self, view: View) -> None:
         """Print the problem or the instruction of a view, unless it was printed last."""
@@ -120,39 +121,15 @@ class Terminal:
             say(f"[{view.confirmed}{self._goal}]{number} {view.problem or view.instruction}")
 
     def action(self) -> Action | None:
-        """The action of the next key that was pressed, or None.
-
-        Enter and d are ignored if they were pressed before the person saw the current stage.
-        """
-        while select.select([sys.stdin], [], [], 0)[0]:
-            data = os.read(sys.stdin.fileno(), 1)
-            if not data:
+        """The action of the next line, or None. Only `q` counts before the person has seen the current stage."""
+        while self._listens and select.select([sys.stdin], [], [], 0)[0]:
+            line = b""
+            while not line.endswith(b"\n") and (more := os.read(sys.stdin.fileno(), 1)):
+                line += more
+            if not line:
                 say("the standard input has ended")
                 return Action.STOP
-            if not sys.stdin.isatty():
-                while not data.endswith(b"\n") and (more := os.read(sys.stdin.fileno(), 1)):
-                    data += more
-                data = data.strip() or b"\n"
-            action = KEYS.get(data.decode(errors="replace").lower())
+            action = LINES.get(line.decode(errors="replace").strip().lower())
             if action is not None and (action is Action.STOP or self._stages[0] is self._stages[1]):
                 return action
         return None
-
-
-@contextlib.contextmanager
-def single_keys() -> Iterator[None]:
-    """Let the program read each key at once, without waiting for Enter."""
-    if not sys.stdin.isatty():
-        yield
-        return
-    try:
-        import termios
-        import tty
-    except ImportError as error:
-        raise ValueError("the terminal of this system cannot be read key by key: leave out --headless") from error
-    before = termios.tcgetattr(sys.stdin)
-    try:
-        tty.setcbreak(sys.stdin)
-        yield
-    finally:
-        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
