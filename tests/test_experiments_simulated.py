@@ -76,8 +76,9 @@ def test_the_sensor_file_of_the_twin_rectifies_to_the_simulated_view(tmp_path):
     assert np.abs(empty.visual - sts.hardware.proof.thumbnail(pair.visual.image)).mean() < 1
     # The object's middle, seen through the lens of the file, lies at the place of its pose.
     dark = np.abs(made.backgrounds(tmp_path)[0] - held.visual.image.astype(float)).mean(-1)
-    view = hardware.rectified(made.lens, sts.Sensor().camera, (255 * (dark > 30)).astype(np.uint8)[..., None], (96, 96))
-    rows, columns = np.nonzero(view.reshape(96, 96) > 127)
+    mask = np.repeat((255 * (dark > 30)).astype(np.uint8)[..., None], 3, -1)
+    view = hardware.rectified(made.lens, sts.Sensor().camera, mask, (96, 96))
+    rows, columns = np.nonzero(view[..., 0] > 127)
     side = 2 * float(sts.Sensor().camera.distance) * 0.75
     middle = (np.array([columns.mean(), rows.mean()]) + 0.5) / 96 * side - side / 2
     assert math.dist(middle, pose[:2]) < 0.035
