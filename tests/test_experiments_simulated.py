@@ -89,7 +89,7 @@ def test_the_sensor_file_of_the_twin_rectifies_to_the_simulated_view(tmp_path):
     [
         ({"camera": "/dev/video0"}, "--camera is /dev/video0, but no device is used with --twin: leave out --camera"),
         ({"lock": False}, r"--no-lock has no effect on the digital twin \(--twin\): leave out"),
-        ({"levels": (0, 0, 0, 256)}, r"levels must be four integers from 0 to 255, .* got \(0, 0, 0, 256\)"),
+        ({"levels": (0, 0, 0, 256)}, r"levels must be .* got \(0, 0, 0, 256\)"),
         ({"count": 0}, "count must be >= 1, got 0"),
         ({"size": (0, 480)}, "at least 1 pixel"),
     ],
