@@ -174,21 +174,15 @@ def test_a_calibrated_lens_rectifies_a_marker_to_its_place_on_the_pad(noisy, ray
     assert errors.max() < 1.0
 
 
-@pytest.mark.parametrize("quarters", [1, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3))])
-def test_a_board_that_lies_on_the_pad_in_another_orientation_gives_the_same_pad(images, rays, printed, quarters):
-    turn = Rotation.from_euler("z", quarters * math.pi / 2)
+def test_a_board_that_lies_on_the_pad_in_another_orientation_gives_the_same_pad(images, rays, printed):
+    turn = Rotation.from_euler("z", math.pi / 2)
     rotation = (Rotation.from_rotvec(TRUE.rotation) * turn).as_rotvec()
     turned = calibration_images.board_view(rays, *printed, rotation, TRUE.translation)
-    assert_recovered(calibrate([*images[1:], turned], BOARD, on_pad=10), view_error=0.2, position_error=2e-4)
-
-
-@pytest.mark.slow
-def test_colour_images_give_the_same_lens_and_images_without_the_board_are_left_out(images):
-    colour = [np.repeat(image[..., None], 3, axis=-1) for image in images]
-    calibration = calibrate([*colour, np.full((480, 640, 3), 90, np.uint8)], BOARD)
-    assert calibration.errors[-1] is None
-    assert calibration.corners[-1] == 0
-    assert calibration.lens == calibrate(images, BOARD).lens
+    empty = np.full((480, 640), 90, np.uint8)
+    colour = [np.repeat(image[..., None], 3, axis=-1) for image in [*images[1:], turned, empty]]
+    calibration = calibrate(colour, BOARD, on_pad=10)
+    assert (calibration.errors[-1], calibration.corners[-1]) == (None, 0)
+    assert_recovered(calibration, view_error=0.2, position_error=2e-4)
 
 
 def corners_of(lens, poses, noise, rng, project=None):
@@ -209,7 +203,7 @@ def pad_points():
     return np.stack([x.ravel(), y.ravel(), np.zeros(64)], axis=-1)
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 6))])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 4))])
 def test_lenses_of_all_fields_of_view_are_recovered(seed):
     rng = np.random.default_rng(seed)
     width, height = [(640, 480), (1640, 1232)][seed % 2]

@@ -1,6 +1,5 @@
 """The digital twin: light over exposures, photometry against `expose`, scene, virtual clock, and second clients."""
 
-import ast
 import dataclasses
 import json
 import random
@@ -53,7 +52,7 @@ def random_history(rise_s, seed):
 
 
 @pytest.mark.parametrize("rise_s", [0.0, 0.004, 0.3])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_light_of_an_interval_equals_small_steps(rise_s, seed):
     history, changes = random_history(rise_s, seed)
     step = 1e-5
@@ -123,18 +122,6 @@ def test_noise_has_the_stated_deviation_in_linear_light(value):
     assert found.std() == pytest.approx(np.hypot(0.01, np.sqrt(value / 2000)), rel=0.05)
 
 
-def test_noise_differs_between_frames_and_repeats_with_the_seed():
-    def frames(seed):
-        blender = twin.Blender(twin.Imperfections(), seed=seed)
-        ends = blender.ends(*np.full((2, 20, 30, 3), 0.5))
-        return np.stack([blender.frame(ends, 0.5) for _ in range(1500)])
-
-    first = frames(0)
-    assert len({frame.tobytes() for frame in first}) == len(first)
-    assert np.array_equal(first, frames(0))
-    assert not np.array_equal(first, frames(1))
-
-
 def test_vignetting_takes_its_share_in_the_corners():
     blender = twin.Blender(dataclasses.replace(PERFECT, vignetting=0.4))
     ends = blender.ends(*np.ones((2, 41, 61, 3)))
@@ -169,23 +156,21 @@ def run(seed, path):
     """Captures with random switches. Returns the switches, the truths and the images."""
     rng = random.Random(seed)
     constants = twin.Imperfections(lag_s=rng.uniform(0.015, 0.12), jitter_s=0.01, rise_s=0.0, exposure_s=0.015)
-    changes, truths, images = [], [], []
+    changes, frames = [], []
     with twin.Twin(picture(), rate=60, imperfections=constants, seed=seed, log=path) as device:
         for _ in range(40):
             changes.append(device.set(rng.choice([ON, OFF, (255, 0, 128, 1)])))
             device.step(rng.uniform(0, 0.1))
             for _ in range(rng.randrange(5)):
-                truth, image = device.capture()
-                assert truth.end_s + constants.lag_s <= truth.due_s <= device.now_s
-                truths.append(truth)
-                images.append(image)
-    return changes, truths, images
+                frames.append(device.capture())
+                assert frames[-1][0].end_s + constants.lag_s <= frames[-1][0].due_s <= device.now_s
+    return changes, *zip(*frames, strict=True)
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_log_agrees_with_the_acknowledged_lights(seed, tmp_path):
-    changes, truths, _ = run(seed, tmp_path / "log")
-    assert twin.read_log(tmp_path / "log") == truths
+@pytest.mark.parametrize("seed", range(2))
+def test_log_agrees_with_the_acknowledged_lights_and_repeats_with_the_seed(seed, tmp_path):
+    changes, truths, images = run(seed, tmp_path / "log")
+    assert twin.read_log(tmp_path / "log") == list(truths)
     pure = mixed = 0
     for truth in truths:
         for lit, following in zip(changes, [*changes[1:], None], strict=True):
@@ -193,25 +178,10 @@ def test_log_agrees_with_the_acknowledged_lights(seed, tmp_path):
                 assert truth.light == truth.lowest == truth.highest == sum(lit.levels) / 1020
                 pure += 1
         mixed += truth.lowest < truth.highest
-    assert pure
-    assert mixed
-
-
-def test_the_same_seed_gives_the_same_frames(tmp_path):
-    first, second = run(3, tmp_path / "a"), run(3, tmp_path / "b")
-    assert first[1] == second[1]
-    np.testing.assert_array_equal(first[2], second[2])
-
-
-def test_images_are_rgb_and_follow_the_light():
-    with twin.Twin(picture(), imperfections=PERFECT) as device:
-        dark = device.capture()[1]
-        device.set(ON)
-        device.step(0.1)
-        bright = device.capture()[1]
-    red, blue = dark.mean((0, 1)), bright.mean((0, 1))
-    assert red[0] > 2 * red[1] > 2 * red[2]
-    assert blue[2] > 2 * blue[1] > 2 * blue[0]
+    assert min(pure, mixed) > 0
+    _, again, same = run(seed, tmp_path / "again")
+    assert again == truths
+    np.testing.assert_array_equal(images, same)
 
 
 def test_watchdog_turns_the_virtual_lights_off():
@@ -381,16 +351,9 @@ def test_second_client_confirms_the_light_of_every_frame(lag_s, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("lag_s", [0.015, 0.05, 0.12])
+@pytest.mark.parametrize("lag_s", [0.015, 0.12])
 def test_second_client_confirms_the_light_at_60_frames_a_second(lag_s, tmp_path):
-    check_summary(judge(tmp_path, rate=60, lag_s=lag_s, switches=120), 120)
-
-
-def test_second_client_imports_nothing_of_the_library():
-    tree = ast.parse(CLIENT.read_text())
-    imported = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
-    assert not [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
-    assert imported <= {"argparse", "json", "sys", "time", "zlib", "cv2", "serial"}
+    check_summary(judge(tmp_path, rate=60, lag_s=lag_s, switches=60), 60)
 
 
 @pytest.mark.parametrize(

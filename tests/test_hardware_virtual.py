@@ -211,44 +211,6 @@ def test_the_hand_moves_the_object_as_the_guide_asks(tmp_path):
     assert [str(phase) for phase in phases[:6]] == ["held", "still", "empty"] * 2
 
 
-def test_a_collection_is_continued_with_the_next_trajectory(tmp_path):
-    class Interrupted(twin.Hand):
-        def show(self, view):
-            super().show(view)
-            if view.number == 1 and view.initial is not None:
-                raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        collected(Spots(), tmp_path, 4, Interrupted)
-    first = hardware.next_recording(tmp_path)
-    assert first == 2  # 1 has an initial pair only
-    scene = Spots(first=first)
-    collected(scene, tmp_path, 3)
-    assert_spots(tmp_path, [0, 2, 3], scene)
-
-
-def test_a_disk_that_is_busy_after_each_trajectory_delays_the_hand_only(tmp_path, monkeypatch):
-    answers = iter(["the disk is too slow"] * 40)  # 8 s, longer than the hand waits for a contact
-
-    confirm, confirmed = hardware.Session.confirm, []
-
-    def confirming(self, number, note=""):
-        confirmed.append(number)
-        confirm(self, number, note)
-
-    def busy(self):
-        # `self.confirmed` grows only when the background thread has written the files, at a time that varies.
-        if confirmed and (problem := next(answers, None)) is not None:
-            raise hardware.SessionError(problem)
-
-    monkeypatch.setattr(hardware.Session, "confirm", confirming)
-    monkeypatch.setattr(hardware.Session, "check_ready", busy)
-    scene = Spots()
-    collected(scene, tmp_path, 2)
-    assert next(answers, None) is None
-    assert_spots(tmp_path, range(2), scene)
-
-
 def test_a_pose_without_contact_is_left_out_with_its_number(tmp_path):
     scene = Spots(unseen=(1,))
     collected(scene, tmp_path, 3)
