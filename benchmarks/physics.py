@@ -43,14 +43,14 @@ from sts_jax import dataset, objects, physics, storage
 from sts_jax.dataset.rendering import RENDER_BATCH
 from sts_jax.physics import bodies as physics_bodies
 from sts_jax.physics import contact, scene
+from sts_jax.physics.bodies import rigid_of_draws
+from sts_jax.physics.engines import Worlds, drawn_fields, gravity_at, roll_worlds
+from sts_jax.physics.scenario import G
+from sts_jax.physics.scene import mjx
+from sts_jax.physics.simulation import WORKERS
 
 # `simulate` has no public way to measure its compiled functions separately. If their names change, these imports fail.
-from sts_jax.physics.draws import draw as draw_starts
-from sts_jax.physics.engines import Worlds, drawn_fields, gravity_at, roll_worlds
-from sts_jax.physics.mass_properties import rigid_of_draws
-from sts_jax.physics.scenario import G
-from sts_jax.physics.simulation import WORKERS
-from sts_jax.physics.solver import mjx
+from sts_jax.physics.simulation import draw as draw_starts
 from sts_jax.sensor import Sensor
 
 RESULTS = Path(__file__).parent / "results" / "physics"

@@ -1,7 +1,6 @@
 """Datasets of mesh files: usable objects are collected, and all others are left out with a reason."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ SCENARIO = physics.Perturbed(frames=3)
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     """Three boxes, three cans, a leaning can that falls over by itself, and a torn file."""
     for i in range(3):
         for label, mesh in (
@@ -38,7 +37,7 @@ def collection(meshes: dataset.Meshes) -> dataset.Collection:
     )
 
 
-def test_usable_objects_are_collected_and_others_are_listed(folder: Path, tmp_path_factory: pytest.TempPathFactory):
+def test_usable_objects_are_collected_and_others_are_listed(folder, tmp_path_factory):
     lines: list[str] = []
     meshes, listing = dataset.survey_meshes(folder, SCENARIO, progress=lines.append)
     assert meshes.names == tuple(f"{label}/{i}.stl" for label in ("box", "can") for i in range(3))
@@ -73,7 +72,7 @@ def test_usable_objects_are_collected_and_others_are_listed(folder: Path, tmp_pa
     assert dataset.survey_meshes(folder, SCENARIO)[0].digest != meshes.digest
 
 
-def test_one_mesh_under_several_names_is_one_object(tmp_path: Path):
+def test_one_mesh_under_several_names_is_one_object(tmp_path):
     """Otherwise it could be trained on under one name and tested on under another."""
     mesh = trimesh.creation.icosphere(2, 0.02)
     mesh.vertices *= [1.0, 1.3, 0.8]
@@ -90,7 +89,7 @@ def test_one_mesh_under_several_names_is_one_object(tmp_path: Path):
 
 
 def test_an_object_that_cannot_be_simulated_is_left_out_and_the_others_are_collected(
-    folder: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+    folder, tmp_path_factory, monkeypatch
 ):
     one = collection(dataset.survey_meshes(folder, SCENARIO)[0])
     simulate = physics.simulate
@@ -117,7 +116,7 @@ def test_an_object_that_cannot_be_simulated_is_left_out_and_the_others_are_colle
         assert np.mean(np.asarray(shown[0][0]) != pairs.visual[row, 0]) < 0.01
 
 
-def test_a_file_deleted_after_the_survey_is_left_out(folder: Path, tmp_path_factory: pytest.TempPathFactory):
+def test_a_file_deleted_after_the_survey_is_left_out(folder, tmp_path_factory):
     one = collection(dataset.survey_meshes(folder, SCENARIO)[0])
     out = tmp_path_factory.mktemp("out") / "dataset"
     (folder / "can" / "1.stl").unlink()
@@ -128,7 +127,7 @@ def test_a_file_deleted_after_the_survey_is_left_out(folder: Path, tmp_path_fact
     np.testing.assert_array_equal(dataset.load(out).trajectory["body"], [0, 1, 2, 3, 5])
 
 
-def test_a_folder_without_usable_objects_and_a_wrong_number_are_refused(folder: Path, tmp_path: Path):
+def test_a_folder_without_usable_objects_and_a_wrong_number_are_refused(folder, tmp_path):
     for path in folder.rglob("*.stl"):
         if "leaning" not in path.name:
             path.unlink()

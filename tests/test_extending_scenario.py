@@ -119,14 +119,18 @@ def test_a_bottle_that_is_pushed_hard_goes_farther(page):
     assert np.all(moved[1] > moved[0])
 
 
+TAKEN = enum.IntEnum("Taken", {"STOPS": 0})
+
+
 @pytest.mark.parametrize(
     ("changes", "match"),
     [
-        ({"outcomes": (physics.Outcome.RESTS,)}, r"any object can leave the pad: add physics\.Outcome\.FELL_OFF"),
-        ({"quantities": ()}, r"returns a condition of length 2, but scenario.quantities declares .* length 0"),
+        ({"outcomes": (physics.Outcome.RESTS,)}, r"add physics\.Outcome\.FELL_OFF"),
+        ({"outcomes": (TAKEN.STOPS, physics.Outcome.FELL_OFF)}, r"0 to 7 are reserved for .* number your own outcomes"),
+        ({"quantities": ()}, r"returns a condition of length 2, but scenario.quantities declares 0"),
         (
             {"quantities": (physics.Quantity("a", "s", 1.0), physics.Quantity("b", "m", 1.0, vector=True))},
-            "scenario.quantities has the order a, b, but vectors must come before scalars: move the vectors",
+            "scenario.quantities has the order a, b, but vectors must come before scalars",
         ),
         (
             {"outcomes": (physics.Outcome.FELL_OFF,)},
@@ -140,27 +144,16 @@ def test_mistakes_in_a_scenario_are_named(page, changes, match):
         physics.simulate(jax.random.key(0), page["bottle"], sts.Sensor(), wrong())
 
 
-def test_outcomes_of_another_enumeration_need_numbers_of_their_own(page):
-    end = enum.IntEnum("Taken", {"STOPS": 0})
-    wrong = type("Wrong", (page["Rolled"],), {"outcomes": (end.STOPS, physics.Outcome.FELL_OFF)})
-    with pytest.raises(ValueError, match=r"0 to 7 are reserved for .* number your own outcomes from 100"):
-        wrong().check()
-
-
 def test_a_scenario_that_is_no_frozen_dataclass_is_refused(page):
-    class Plain:
-        """Has no member of a scenario."""
-
-    thawed = dataclasses.make_dataclass("Thawed", [])
-    for wrong in (Plain(), thawed(), page["Rolled"]):
-        with pytest.raises(TypeError, match=r"a frozen dataclass of your own that derives from physics\.Scenario"):
+    for wrong in (dataclasses.make_dataclass("Thawed", [])(), page["Rolled"]):
+        with pytest.raises(TypeError, match=r"a frozen dataclass that derives from physics\.Scenario"):
             inspect.unwrap(physics.simulate)(jax.random.key(0), page["bottle"], sts.Sensor(), wrong)
 
 
 def test_a_variant_needs_the_fields_that_it_changes(page):
     scenario = page["Rolled"]()
     assert physics.variant(scenario, "wide-friction") == dataclasses.replace(scenario, friction=(0.3, 0.9))
-    with pytest.raises(ValueError, match="declare fill, shell_scale, tilt in the scenario's dataclass"):
+    with pytest.raises(ValueError, match="needs the fields fill, shell_scale, tilt in Rolled"):
         physics.variant(scenario, "off")
 
 

@@ -68,7 +68,7 @@ def touching(shape: np.ndarray, where: str, depth: float, count: int = 40) -> np
 
 @pytest.mark.parametrize("where", ["middle", "rim", "corner"])
 @pytest.mark.parametrize("name", ["box", "rod", "ball"])
-def test_deepest_contact_is_that_of_c_mujoco(name: str, where: str) -> None:
+def test_deepest_contact_is_that_of_c_mujoco(name, where):
     shape = points(name)
     model = scene.compile_scene(shape, PAD, physics.Contact())
     poses = touching(shape, where, 0.0005)
@@ -85,7 +85,7 @@ def test_deepest_contact_is_that_of_c_mujoco(name: str, where: str) -> None:
 
 
 @pytest.mark.parametrize("where", ["middle", "rim", "corner"])
-def test_no_contact_where_c_mujoco_has_none(where: str) -> None:
+def test_no_contact_where_c_mujoco_has_none(where):
     shape = points("box")
     poses = touching(shape, where, 0.0005)
     poses[:, 2] += 0.003
@@ -95,7 +95,7 @@ def test_no_contact_where_c_mujoco_has_none(where: str) -> None:
     assert np.all(deepest_in_ours(contact.hull(shape), poses)[0][apart] > 0)
 
 
-def test_a_flat_base_is_supported_all_round() -> None:
+def test_a_flat_base_is_supported_all_round():
     hull = contact.hull(points("rod"))
     found = contact.collide(hull, jnp.array([0.01, 0.0, -1e-4, 1.0, 0, 0, 0]), HALF)
     used = np.asarray(found.pos)[np.asarray(found.dist) < 0] - [0.01, 0, 0]
@@ -105,15 +105,7 @@ def test_a_flat_base_is_supported_all_round() -> None:
     assert np.max(np.diff(np.append(angle, angle[0] + 2 * np.pi))) < np.deg2rad(70)
 
 
-def test_frames_are_right_handed_and_start_with_the_normal() -> None:
-    poses = touching(points("ball"), "rim", 0.0005, count=10)
-    found = COLLIDE(contact.hull(points("ball")), poses, HALF)
-    frames = np.asarray(found.frame).reshape(-1, 3, 3)
-    np.testing.assert_allclose(frames @ frames.transpose(0, 2, 1), np.tile(np.eye(3), (len(frames), 1, 1)), atol=1e-5)
-    np.testing.assert_allclose(np.linalg.det(frames), 1, atol=1e-5)
-
-
-def test_padding_changes_nothing() -> None:
+def test_padding_changes_nothing():
     shape = points("box")
     more = np.concatenate([shape, np.repeat(shape[-1:], 32, axis=0)])
     pose = jnp.array([0.05, 0.01, 0.0398, *geometry.random_quat(jax.random.key(0)) * 0 + jnp.array([1.0, 0, 0, 0])])
@@ -121,13 +113,8 @@ def test_padding_changes_nothing() -> None:
     np.testing.assert_array_equal(np.sort(a.dist), np.sort(b.dist))
 
 
-def test_flat_points_are_refused() -> None:
-    with pytest.raises(ValueError, match="no volume"):
-        contact.hull(np.random.default_rng(0).normal(size=(1, 32, 3)) * [1, 1, 0])
-
-
 @pytest.mark.slow
-def test_convex_parts_leave_the_space_between_them_free() -> None:
+def test_convex_parts_leave_the_space_between_them_free():
     # An arch of two posts and a beam straddles the stop wall. Its beam lies 5 mm above the wall.
     def box(centre: list[float], size: list[float]) -> np.ndarray:
         grid = np.stack(np.meshgrid([-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5]), -1).reshape(-1, 3) * size + centre
@@ -149,7 +136,7 @@ def test_convex_parts_leave_the_space_between_them_free() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("lean", [0.0, 0.4, -0.4])
-def test_the_wall_holds_an_object_that_lies_across_it_as_in_c_mujoco(lean: float) -> None:
+def test_the_wall_holds_an_object_that_lies_across_it_as_in_c_mujoco(lean):
     grid = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3) * [0.01, 0.05, 0.004]
     rod = np.concatenate([grid, np.repeat(grid[-1:], 24, axis=0)])[None]
     model = scene.compile_scene(rod, PAD, physics.Contact(), 0.02)
@@ -172,7 +159,7 @@ def test_the_wall_holds_an_object_that_lies_across_it_as_in_c_mujoco(lean: float
 
 
 @pytest.mark.parametrize("yaw", [0.0, 1e-7, 1e-5, 1e-3])
-def test_edges_nearly_parallel_to_a_rim_keep_all_contacts(yaw: float) -> None:
+def test_edges_nearly_parallel_to_a_rim_keep_all_contacts(yaw):
     pose = jnp.array([0.03, -0.01, 0.02 - 3e-5, np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
     box = points("box")[:, :, [0, 2, 1]]  # lies on its side, 60 x 80 mm
     found = contact.collide(jax.tree.map(jnp.asarray, contact.hull(box)), pose, HALF)
@@ -183,7 +170,7 @@ def test_edges_nearly_parallel_to_a_rim_keep_all_contacts(yaw: float) -> None:
 
 
 @pytest.mark.parametrize("lean", [0.0, 0.02, 0.1])
-def test_both_rims_hold_an_edge_across_a_corner_whose_ends_are_lower(lean: float) -> None:
+def test_both_rims_hold_an_edge_across_a_corner_whose_ends_are_lower(lean):
     """A rod on one of its long edges, whose ends lie beyond two sides of the pad. It leans along its length."""
     grid = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3) * [0.06, 0.005, 0.005]
     rod = np.concatenate([grid, np.repeat(grid[-1:], 24, axis=0)]).astype(np.float32)[None]

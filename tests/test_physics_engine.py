@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import inspect
 
 import jax
 import jax.numpy as jnp
@@ -19,21 +18,6 @@ PAD = (0.15, 0.15)
 BODIES = [objects.make(jax.random.key(i), name) for i, name in enumerate(["bottle", "fork", "watch"])]
 FIELDS = ("pose", "velocity", "wrench", "contact", "wall", "settled", "touches", "sunk")
 simulate = functools.partial(physics.simulate, jax.random.key(3), sensor=Sensor(), engine="mujoco")
-
-
-def contact_wrenches(model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, np.ndarray]:
-    """Force and moment about the origin that pad and wall exert on the object, from MuJoCo's own contact forces."""
-    found = {"pad": np.zeros(6), "wall": np.zeros(6)}
-    for index in range(data.ncon):
-        contact, own = data.contact[index], np.zeros(6)
-        mujoco.mj_contactForce(model, data, index, own)
-        axes = contact.frame.reshape(3, 3)
-        names = [model.geom(geom).name for geom in contact.geom]
-        side = next(name for name in names if name in found)
-        sign = 1 if names[0] == side else -1  # the force is that of the first geom on the second
-        force, torque = sign * axes.T @ own[:3], sign * axes.T @ own[3:]
-        found[side] += [*force, *(torque + np.cross(contact.pos, force))]
-    return found
 
 
 def plain_loop(
@@ -57,7 +41,7 @@ def plain_loop(
     back = pose[3:] * [1, -1, -1, -1]
     data.qvel[:3] = velocity[:3]
     mujoco.mju_rotVecQuat(data.qvel[3:], velocity[3:], back)
-    timestep = model.opt.timestep
+    timestep, has_wall = model.opt.timestep, mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "wall") >= 0
     slow = touches = 0
     apart, gone = 2**20, False
     frames: dict[str, list] = {name: [] for name in ("pose", "velocity", "wrench", "contact", "wall")}
@@ -75,9 +59,9 @@ def plain_loop(
             mujoco.mj_step1(model, data)
             mujoco.mj_step2(model, data)
             # Contact forces belong to the step, because mj_step2 only moves the state.
-            pushes = contact_wrenches(model, data)
-            contact, wall = bool(pushes["pad"].any()), bool(pushes["wall"].any())
-            impulse, loaded = (impulse + pushes["pad"], loaded + 1) if contact else (np.zeros(6), 0)
+            push = physics.wrench(model, data, "pad")
+            contact, wall = bool(push.any()), has_wall and bool(physics.wrench(model, data, "wall").any())
+            impulse, loaded = (impulse + push, loaded + 1) if contact else (np.zeros(6), 0)
             touches += (contact or wall) and apart * timestep >= roll.PARTED_TIME - 1e-9
             apart = 0 if contact or wall else apart + 1
             is_slow = np.linalg.norm(data.qvel[:3]) < roll.SLOW_SPEED and np.linalg.norm(data.qvel[3:]) < roll.SLOW_TURN
@@ -109,7 +93,7 @@ PUSHED = np.array([0.2, -0.1, 0.05, 2.0, -3.0, 4.0])  # m/s, rad/s
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_native_roll_equals_a_plain_loop_of_steps(name: str) -> None:
+def test_native_roll_equals_a_plain_loop_of_steps(name):
     scenario, pose, held = CASES[name]
     body = BODIES[0]
     pose = np.array([*pose[:3], *(np.array(pose[3:]) / np.linalg.norm(pose[3:]))])
@@ -144,7 +128,7 @@ def test_native_roll_equals_a_plain_loop_of_steps(name: str) -> None:
 
 
 @pytest.mark.parametrize("as_force", [True, False])
-def test_a_jerked_box_slides_by_coulombs_law(as_force: bool) -> None:
+def test_a_jerked_box_slides_by_coulombs_law(as_force):
     half, mass, friction = np.array([0.03, 0.03, 0.008]), 0.1, 0.5
     pull, lasts, frames, steps = 8.0, 0.08, 6, 160
     points = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3) * half
@@ -167,13 +151,11 @@ def test_a_jerked_box_slides_by_coulombs_law(as_force: bool) -> None:
 
 
 @pytest.fixture(scope="module")
-def drops() -> physics.Trajectory:
+def drops():
     return jax.tree.map(np.asarray, simulate(BODIES, scenario=physics.Freefall(), num=6))
 
 
-def test_results_are_independent_of_chunk_thread_and_other_bodies(
-    drops: physics.Trajectory, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_results_are_independent_of_chunk_thread_and_other_bodies(drops, monkeypatch):
     alone = simulate(BODIES[0], scenario=physics.Freefall(), num=3, chunk=1)
     monkeypatch.setattr("os.cpu_count", lambda: 5)
     other = simulate(BODIES[:2], scenario=physics.Freefall(), num=6, chunk=4)
@@ -190,9 +172,7 @@ def test_results_are_independent_of_chunk_thread_and_other_bodies(
         *(pytest.param(scenario, marks=pytest.mark.slow) for scenario in (physics.Inclined(), physics.Perturbed())),
     ],
 )
-def test_freezing_a_settled_object_keeps_its_end_and_its_wrench(
-    scenario: physics.Scenario, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_freezing_a_settled_object_keeps_its_end_and_its_wrench(scenario, monkeypatch):
     bodies = BODIES[:1] if scenario.must_stand else BODIES
     num = 18 // len(bodies)
     frozen = jax.tree.map(np.asarray, simulate(bodies, scenario=scenario, num=num))
@@ -213,7 +193,7 @@ def test_freezing_a_settled_object_keeps_its_end_and_its_wrench(
     np.testing.assert_allclose(frozen.wrench[alone, -1, :3], rolled.wrench[alone, -1, :3], atol=0.02 * largest)
 
 
-def test_a_weak_pull_does_not_end_a_trajectory_before_a_strong_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_weak_pull_does_not_end_a_trajectory_before_a_strong_one(monkeypatch):
     # For a second the pull is too weak to move the bottle. Then it topples the bottle.
     class Late(physics.Perturbed):
         def gravity(self, time: jax.Array, condition: jax.Array) -> jax.Array:
@@ -225,7 +205,7 @@ def test_a_weak_pull_does_not_end_a_trajectory_before_a_strong_one(monkeypatch: 
     assert np.linalg.norm(traj.pose[:, after, :3] - traj.pose[:, before, :3], axis=-1).min() > 0.01
 
 
-def test_compound_bodies_land_on_their_parts() -> None:
+def test_compound_bodies_land_on_their_parts():
     body = BODIES[0]
     left, right = np.asarray(body.hulls[0]), np.asarray(body.hulls[0]) + np.float32([0.05, 0, 0])
     parts = dataclasses.replace(body, hulls=jnp.asarray(np.stack([left, *[right] * 7])))
@@ -236,14 +216,7 @@ def test_compound_bodies_land_on_their_parts() -> None:
     np.testing.assert_allclose(lowest, 0, atol=5e-5)
 
 
-def test_c_mujoco_is_the_default_and_unknown_engines_are_refused(drops: physics.Trajectory) -> None:
-    found = physics.simulate(jax.random.key(3), BODIES[0], Sensor(), physics.Freefall(), 1)
-    np.testing.assert_array_equal(found.pose, drops.pose[:1])
-    with pytest.raises(ValueError, match="engine is 'bullet', but it must be 'mjx' or 'mujoco'"):
-        inspect.unwrap(physics.simulate)(jax.random.key(3), BODIES[0], Sensor(), physics.Freefall(), engine="bullet")
-
-
-def test_progress_counts_trajectories() -> None:
+def test_progress_counts_trajectories():
     done: list[int] = []
     simulate(BODIES[0], scenario=physics.Freefall(), num=4, chunk=1, progress=done.append)
     assert done == [1, 2, 3, 4]

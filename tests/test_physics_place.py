@@ -1,8 +1,5 @@
 """Bodies at rest: C MuJoCo leaves them there and carries them with the same wrench, and the gel balances them."""
 
-import dataclasses
-import inspect
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -20,7 +17,7 @@ PLACES = {"yaw": 0.7, "position": (0.03, -0.02), "fill": 0.3}
 
 
 @pytest.fixture(scope="module")
-def bodies() -> list[objects.Body]:
+def bodies():
     return [objects.make(jax.random.key(i), name) for i, name in enumerate(objects.CATEGORIES)]
 
 
@@ -35,14 +32,7 @@ def simulated(body: objects.Body, pose: np.ndarray, fill: float, seconds: float)
     wrenches = []
     for _ in range(round(seconds / contact.timestep)):
         mujoco.mj_step(model, data)
-        total, own = np.zeros(6), np.zeros(6)
-        for index in range(data.ncon):
-            mujoco.mj_contactForce(model, data, index, own)
-            touching = data.contact[index]
-            push, twist = (touching.frame.reshape(3, 3).T @ part for part in (own[:3], own[3:]))
-            sign = 1 if model.geom_bodyid[touching.geom2] > 0 else -1  # the force is on the second geom
-            total += sign * np.concatenate([push, twist + np.cross(touching.pos, push)])
-        wrenches.append(total)
+        wrenches.append(physics.wrench(model, data, "pad"))
     return data.qpos.copy(), np.mean(wrenches[len(wrenches) // 2 :], axis=0)
 
 
@@ -108,48 +98,3 @@ def test_more_shell_or_contents_weigh_more(bodies):
     )
     np.testing.assert_allclose(heavy, 2 * light, rtol=1e-5)
     assert full > light + 9.81 * 0.05
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"face": 99}, r"`face` is 99, .* no such face: the body can rest on faces 0 \(the most likely\) to \d+"),
-        ({"face": -1}, r"`face` is -1, but the body has no such face: the body can rest on faces 0"),
-        ({"face": "sideways"}, r"`face` is 'sideways', but it must be the index of a face or 'upright'"),
-        ({"position": (0.2, 0.0)}, r"position is \(0.2, 0.0\) m, .* beyond the pad"),
-        ({"position": (0.0, float("nan"))}, "position is .* 2 finite numbers"),
-        ({"yaw": float("inf")}, "yaw is inf, but it must be one finite number"),
-        ({"fill": 1.5}, "fill is 1.5, .* from 0 to 1"),
-        ({"shell_scale": 0.0}, "shell_scale is 0.0, but it must be > 0"),
-        ({"up": (0.0, 0.0, 2.0)}, r"`up` is .* which has the length 2, but it must have the length 1"),
-    ],
-)
-def test_errors_name_arguments_of_place_that_are_out_of_range(bodies, changes, message):
-    with pytest.raises(ValueError, match=message):
-        physics.rest.place.__wrapped__(bodies[0], sts.Sensor(), **changes)
-
-
-def test_errors_name_bodies_that_cannot_be_placed(bodies):
-    leaning = Rotation.from_euler("x", 30, degrees=True).as_matrix().astype(np.float32)
-    with pytest.raises(ValueError, match=r"`face` is 'upright', but the body does not stand stably"):
-        physics.place(dataclasses.replace(bodies[0], hulls=bodies[0].hulls @ leaning.T), sts.Sensor(), face="upright")
-    outside = dataclasses.replace(bodies[0], shell_com=jnp.array([0.3, 0.2, 0.3]), contents_density=jnp.float32(0))
-    with pytest.raises(ValueError, match="the body cannot rest on any of its faces"):
-        physics.place(outside, sts.Sensor())
-    with pytest.raises(ValueError, match="hulls span no volume"):
-        physics.place(dataclasses.replace(bodies[0], hulls=jnp.zeros((1, 64, 3))), sts.Sensor())
-    with pytest.raises(ValueError, match=r"vertices has values that are not finite \(1 of"):
-        physics.place(dataclasses.replace(bodies[0], vertices=bodies[0].vertices.at[3, 1].set(jnp.nan)), sts.Sensor())
-
-
-def test_errors_name_arguments_of_place_of_another_type(bodies):
-    sensor, place = sts.Sensor(), inspect.unwrap(physics.place)
-    for given, message in (
-        (("mug.obj", sensor), r"body is 'mug\.obj', but it must be one Body: .* objects\.load reads a mesh file"),
-        ((sensor, bodies[0]), r"body is Sensor\(.*, but it must be one Body"),
-        ((bodies[0], None), "sensor is None, but it must be a Sensor"),
-    ):
-        with pytest.raises(TypeError, match=message):
-            place(*given)
-    with pytest.raises(TypeError, match=r"`body`, .* is traced.* outside jit"):
-        jax.eval_shape(lambda body: inspect.unwrap(physics.rest.stable_faces)(body), bodies[0])

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 import sts_jax as sts
 from sts_jax import objects, physics
-from sts_jax.physics import held, scene
+from sts_jax.physics import rest, scene
 from sts_jax.physics.scenario import STANDING, G
 
 PAD = (0.15, 0.15)
@@ -44,18 +44,18 @@ def block() -> objects.Body:
 
 
 @pytest.fixture(scope="module")
-def bodies() -> list[objects.Body]:
+def bodies():
     return [*(objects.make(jax.random.key(i), "camera") for i in (0, 3)), block()]
 
 
 @pytest.fixture(scope="module")
-def let_go(bodies: list[objects.Body]) -> physics.Trajectory:
+def let_go(bodies):
     found = physics.simulate(jax.random.key(1), bodies, sts.Sensor(), SCENARIO, NUM, engine="mujoco")
     return jax.tree.map(np.asarray, found)
 
 
 @pytest.fixture(scope="module")
-def rigids(bodies: list[objects.Body], let_go: physics.Trajectory) -> physics.Rigid:
+def rigids(bodies, let_go):
     return physics.rigids(bodies, let_go.body, let_go.hidden)
 
 
@@ -68,9 +68,7 @@ def corners(bodies: list[objects.Body], traj: physics.Trajectory, row: int, fram
     return placed(np.asarray(traj.pose[row, frame], np.float64), points)
 
 
-def test_a_held_object_is_at_rest_and_touches_the_pad_with_an_edge_or_a_corner(
-    bodies: list[objects.Body], let_go: physics.Trajectory
-) -> None:
+def test_a_held_object_is_at_rest_and_touches_the_pad_with_an_edge_or_a_corner(bodies, let_go):
     np.testing.assert_array_equal(let_go.velocity[:, 0], 0)
     assert let_go.contact[:, 0].all()
     assert not let_go.wall.any()
@@ -82,9 +80,7 @@ def test_a_held_object_is_at_rest_and_touches_the_pad_with_an_edge_or_a_corner(
         assert np.linalg.matrix_rank(touching - touching[0], tol=1e-3) <= 1  # no face lies on the pad
 
 
-def test_the_held_wrench_carries_a_share_of_the_weight_within_the_contact(
-    bodies: list[objects.Body], let_go: physics.Trajectory, rigids: physics.Rigid
-) -> None:
+def test_the_held_wrench_carries_a_share_of_the_weight_within_the_contact(bodies, let_go, rigids):
     deepest = float(sts.Sensor().gel.max_depth)
     for row in range(len(let_go.pose)):
         force, moment = let_go.wrench[row, 0, :3], let_go.wrench[row, 0, 3:]
@@ -99,7 +95,7 @@ def test_the_held_wrench_carries_a_share_of_the_weight_within_the_contact(
         assert np.all((centre > lowest) & (centre < highest))
 
 
-def test_sense_draws_the_held_pose_without_tilting_it(bodies: list[objects.Body], let_go: physics.Trajectory) -> None:
+def test_sense_draws_the_held_pose_without_tilting_it(bodies, let_go):
     sensor = sts.Sensor()
     for row in range(0, len(let_go.pose), 7):
         frame = sts.sense(
@@ -112,12 +108,12 @@ def test_sense_draws_the_held_pose_without_tilting_it(bodies: list[objects.Body]
 
 
 @pytest.mark.parametrize("force", [0.05, 0.4])
-def test_an_edge_pressed_into_the_gel_sinks_as_a_wedge(force: float) -> None:
+def test_an_edge_pressed_into_the_gel_sinks_as_a_wedge(force):
     lean = np.radians(20)
     body, gel = block(), dataclasses.replace(sts.Sensor().gel, cells=(600, 600))
     turn = Rotation.from_rotvec([0, lean, 0])
     pose = np.array([0.004, -0.003, 0, *turn.as_quat(scalar_first=True)])
-    wrench = held.held_wrench(gel, body, pose, force)
+    wrench = rest.held_wrench(gel, body, pose, force)
     # A wedge of width w sinks by d: F = k w d^2 (cot a + tan a) / 2, with the centre of pressure (cot a - tan a) d / 3
     # from the edge, on the side of the flatter face.
     width, flat, steep = 2 * HALF[1], 1 / np.tan(lean), np.tan(lean)
@@ -129,20 +125,18 @@ def test_an_edge_pressed_into_the_gel_sinks_as_a_wedge(force: float) -> None:
     np.testing.assert_allclose(wrench[3] / force, -0.003, atol=5e-5)
 
 
-def test_a_corner_is_pressed_no_deeper_than_the_gel_allows() -> None:
+def test_a_corner_is_pressed_no_deeper_than_the_gel_allows():
     body, gel = block(), sts.Sensor().gel
     pose = np.array([0, 0, 0, *Rotation.from_euler("xy", [0.6, 0.6]).as_quat(scalar_first=True)])
-    light, heavy = held.held_wrench(gel, body, pose, 0.01), held.held_wrench(gel, body, pose, 50.0)
+    light, heavy = rest.held_wrench(gel, body, pose, 0.01), rest.held_wrench(gel, body, pose, 50.0)
     assert light[2] == pytest.approx(0.01, rel=1e-6)
     assert 0.01 < heavy[2] < 5
     assert sts.sense(sts.Sensor(), body, jnp.asarray(pose), jnp.asarray(heavy)).balanced
     beside = np.array([0.5, 0, 0, *pose[3:]])
-    np.testing.assert_array_equal(held.held_wrench(gel, body, beside, 1.0), 0)
+    np.testing.assert_array_equal(rest.held_wrench(gel, body, beside, 1.0), 0)
 
 
-def test_the_balance_of_the_centre_of_mass_decides_on_which_side_an_object_falls(
-    bodies: list[objects.Body], let_go: physics.Trajectory, rigids: physics.Rigid
-) -> None:
+def test_the_balance_of_the_centre_of_mass_decides_on_which_side_an_object_falls(bodies, let_go, rigids):
     agree, judged = [], 0
     for row in range(len(let_go.pose)):
         first = np.asarray(let_go.pose[row, 0], np.float64)
@@ -159,7 +153,7 @@ def test_the_balance_of_the_centre_of_mass_decides_on_which_side_an_object_falls
 
 
 @pytest.mark.slow
-def test_a_block_beyond_its_balance_topples_and_one_short_of_it_returns() -> None:
+def test_a_block_beyond_its_balance_topples_and_one_short_of_it_returns():
     shares = []
     for beyond in (-np.radians(6), np.radians(6)):
         scenario = dataclasses.replace(SCENARIO, beyond=(beyond, beyond), skew=0.0)
@@ -179,7 +173,7 @@ def upward(pose: jax.Array) -> jax.Array:
     return sts.geometry.quat_to_matrix(pose[3:])[2]
 
 
-def test_no_outcome_is_rare_and_most_objects_stay_on_the_pad(let_go: physics.Trajectory) -> None:
+def test_no_outcome_is_rare_and_most_objects_stay_on_the_pad(let_go):
     share = {outcome: np.mean(let_go.outcome == outcome) for outcome in SCENARIO.outcomes}
     assert share[physics.Outcome.TOPPLES] > 0.1
     assert share[physics.Outcome.RETURNS] > 0.2
@@ -187,9 +181,7 @@ def test_no_outcome_is_rare_and_most_objects_stay_on_the_pad(let_go: physics.Tra
     assert let_go.settled.mean() > 0.9
 
 
-def test_the_first_frame_is_independent_of_everything_after_the_release(
-    bodies: list[objects.Body], let_go: physics.Trajectory
-) -> None:
+def test_the_first_frame_is_independent_of_everything_after_the_release(bodies, let_go):
     # Neither friction nor the contact's constants nor the number of frames change the first frame.
     slippery = let_go.hidden._replace(friction=np.full_like(let_go.hidden.friction, 0.1))
     other = dataclasses.replace(SCENARIO, frames=4, contact=physics.Contact(rolling=0.002))
@@ -207,7 +199,7 @@ def test_the_first_frame_is_independent_of_everything_after_the_release(
     assert np.abs(np.asarray(found.pose)[:, 3] - let_go.pose[:, 3]).max() > 1e-3
 
 
-def test_the_energy_never_rises(bodies: list[objects.Body], let_go: physics.Trajectory, rigids: physics.Rigid) -> None:
+def test_the_energy_never_rises(bodies, let_go, rigids):
     for row in range(len(let_go.pose)):
         mass, com, inertia, _ = (part[row] for part in rigids)
         energy = []
@@ -220,9 +212,7 @@ def test_the_energy_never_rises(bodies: list[objects.Body], let_go: physics.Traj
         assert max(energy) < energy[0] + 0.02 * mass * G * 0.03  # 2 % of a fall of 30 mm
 
 
-def test_objects_fall_as_in_c_mujoco(
-    bodies: list[objects.Body], let_go: physics.Trajectory, rigids: physics.Rigid
-) -> None:
+def test_objects_fall_as_in_c_mujoco(bodies, let_go, rigids):
     # A plain loop of MuJoCo, which finds the contacts of the mesh itself, until rounding decides.
     for row in range(0, len(let_go.pose), 6):
         model = scene.compile_scene(np.asarray(bodies[let_go.body[row]].hulls), PAD, SCENARIO.contact)
@@ -234,7 +224,7 @@ def test_objects_fall_as_in_c_mujoco(
 
 
 @pytest.mark.slow
-def test_both_engines_agree(bodies: list[objects.Body], let_go: physics.Trajectory) -> None:
+def test_both_engines_agree(bodies, let_go):
     found = physics.simulate(jax.random.key(1), bodies, sts.Sensor(), SCENARIO, NUM, chunk=20, engine="mjx")
     for name in ("pose", "wrench", "velocity", "contact"):  # quaternions are normalised differently
         np.testing.assert_allclose(getattr(found, name)[:, 0], getattr(let_go, name)[:, 0], atol=1e-6)
@@ -246,20 +236,7 @@ def test_both_engines_agree(bodies: list[objects.Body], let_go: physics.Trajecto
         )
 
 
-def test_starts_are_those_of_the_key_under_jit_and_vmap(bodies: list[objects.Body]) -> None:
-    points = np.asarray(bodies[2].hulls, np.float64).reshape(-1, 3)
-    shape = physics.Shape(*map(jnp.asarray, (points, *objects.rest_poses(points, np.zeros(3)), np.zeros((16, 3)))))
-    keys = jax.random.split(jax.random.key(4), 3)
-    together = jax.jit(jax.vmap(lambda key: SCENARIO.start(key, shape, PAD)))(keys)
-    for i, key in enumerate(keys):
-        alone = SCENARIO.start(key, shape, PAD)
-        np.testing.assert_allclose(alone.pose, together.pose[i], atol=1e-5)
-        np.testing.assert_allclose(alone.carried, together.carried[i], rtol=1e-6)
-        up = np.abs(np.asarray(upward(alone.pose)))
-        assert up.max() < np.cos(np.radians(5))  # it leans
-
-
-def test_outcomes_follow_from_the_poses() -> None:
+def test_outcomes_follow_from_the_poses():
     first = jnp.array([0.01, 0, 0.05, *Rotation.from_euler("x", 0.4).as_quat(scalar_first=True)])
     cases = {
         physics.Outcome.RETURNS: Rotation.identity(),
@@ -271,30 +248,3 @@ def test_outcomes_follow_from_the_poses() -> None:
             last = jnp.concatenate([jnp.array([0.03, 0.01, 0.02]), quat])
             assert int(SCENARIO.outcome(first, last)) == outcome
             assert int(SCENARIO.outcome(first, last.at[2].set(-0.05))) == physics.Outcome.FELL_OFF
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"beyond": (0.1, -0.1)},
-        {"beyond": (-10.0, 10.0)},
-        {"beyond": (float("nan"), 0.1)},
-        {"skew": -0.1},
-        {"skew": 5.0},
-        {"carried": (0.0, 0.5)},
-        {"carried": (0.5, 1.5)},
-        {"spread": -0.01},
-        {"tries": 0},
-        {"friction": (0.0, 0.5)},
-    ],
-)
-def test_errors_name_bad_fields(change: dict) -> None:
-    with pytest.raises(ValueError, match=f"scenario.{next(iter(change))}"):
-        dataclasses.replace(SCENARIO, **change).check()
-
-
-def test_variants_of_the_hidden_values_exist() -> None:
-    off = physics.variant(SCENARIO, "off")
-    assert off.tilt == 0
-    assert off.fill == (0.4, 0.4)
-    assert physics.variant(SCENARIO, "wide-friction").friction == (0.3, 0.9)

@@ -2,7 +2,6 @@
 
 import copy
 import dataclasses
-import inspect
 import re
 
 import jax
@@ -23,17 +22,17 @@ ROLL = jax.jit(roll.roll)  # compiled once, for (3, 100) steps
 
 
 @pytest.fixture(scope="module")
-def bodies() -> list[objects.Body]:
+def bodies():
     return [objects.make(jax.random.key(i), name) for i, name in enumerate(["bottle", "fork", "webcam", "watch"])]
 
 
 @pytest.fixture(scope="module", params=[pytest.param("mjx", marks=pytest.mark.slow), "mujoco"])
-def engine(request: pytest.FixtureRequest) -> physics.Engine:
+def engine(request):
     return request.param
 
 
 @pytest.fixture(scope="module")
-def drops(bodies: list[objects.Body], engine: physics.Engine) -> physics.Trajectory:
+def drops(bodies, engine):
     found = physics.simulate(jax.random.key(3), bodies, Sensor(), SCENARIO, NUM, chunk=24, engine=engine)
     return jax.tree.map(np.asarray, found)
 
@@ -51,7 +50,7 @@ def c_model(bodies: list[objects.Body], drops: physics.Trajectory, row: int) -> 
     return model, data
 
 
-def test_shapes_and_order(drops: physics.Trajectory) -> None:
+def test_shapes_and_order(drops):
     count, frames = 4 * NUM, SCENARIO.frames
     for name, width in {"pose": 7, "velocity": 6, "wrench": 6, "gravity": 3}.items():
         assert getattr(drops, name).shape == (count, frames, width)
@@ -60,11 +59,11 @@ def test_shapes_and_order(drops: physics.Trajectory) -> None:
     np.testing.assert_allclose(drops.time[0], np.arange(frames) / SCENARIO.rate, rtol=1e-6)
     assert drops.outcome.dtype == np.int32
     np.testing.assert_array_equal(drops.gravity, np.broadcast_to(np.float32([0, 0, -G]), drops.gravity.shape))
+    np.testing.assert_allclose(np.linalg.norm(drops.pose[..., 3:], axis=-1), 1, atol=1e-6)
+    assert np.all(drops.pose[..., 3] >= 0)
 
 
-def test_frame_0_is_at_rest_in_the_air_at_the_stated_height(
-    bodies: list[objects.Body], drops: physics.Trajectory
-) -> None:
+def test_frame_0_is_at_rest_in_the_air_at_the_stated_height(bodies, drops):
     for row in range(4 * NUM):
         matrix = np.empty(9)
         mujoco.mju_quat2Mat(matrix, drops.pose[row, 0, 3:].astype(np.float64))
@@ -76,12 +75,12 @@ def test_frame_0_is_at_rest_in_the_air_at_the_stated_height(
     assert np.all(np.linalg.norm(drops.pose[:, 0, :2], axis=1) <= SCENARIO.spread + 1e-6)
 
 
-def test_free_flight_is_the_parabola(drops: physics.Trajectory) -> None:
+def test_free_flight_is_the_parabola(drops):
     fall = 0.5 * G * drops.time[0, :3] * (drops.time[0, :3] + SCENARIO.contact.timestep)
     np.testing.assert_allclose(drops.pose[:, :3, 2] - drops.pose[:, :1, 2], np.tile(-fall, (4 * NUM, 1)), atol=5e-6)
 
 
-def test_hidden_values_and_outcomes_are_in_range(drops: physics.Trajectory) -> None:
+def test_hidden_values_and_outcomes_are_in_range(drops):
     for name in ("fill", "shell_scale", "friction"):
         low, high = getattr(SCENARIO, name)
         assert np.all((getattr(drops.hidden, name) >= low) & (getattr(drops.hidden, name) <= high))
@@ -92,12 +91,7 @@ def test_hidden_values_and_outcomes_are_in_range(drops: physics.Trajectory) -> N
     assert not drops.resampled.any()
 
 
-def test_quaternions_are_unit_with_positive_w(drops: physics.Trajectory) -> None:
-    np.testing.assert_allclose(np.linalg.norm(drops.pose[..., 3:], axis=-1), 1, atol=1e-6)
-    assert np.all(drops.pose[..., 3] >= 0)
-
-
-def test_the_wrench_at_rest_carries_the_weight(bodies: list[objects.Body], drops: physics.Trajectory) -> None:
+def test_the_wrench_at_rest_carries_the_weight(bodies, drops):
     rows = np.flatnonzero(drops.settled & (drops.outcome == physics.Outcome.RESTS))
     assert len(rows) >= 12
     for row in rows:
@@ -128,9 +122,7 @@ def energy(bodies: list[objects.Body], drops: physics.Trajectory, row: int) -> n
 
 
 @pytest.mark.slow
-def test_energy_out_of_contact_never_exceeds_the_initial_energy(
-    bodies: list[objects.Body], engine: physics.Engine
-) -> None:
+def test_energy_out_of_contact_never_exceeds_the_initial_energy(bodies, engine):
     every_step = dataclasses.replace(SCENARIO, rate=1000.0, frames=400)
     drops = jax.tree.map(
         np.asarray,
@@ -145,9 +137,7 @@ def test_energy_out_of_contact_never_exceeds_the_initial_energy(
     assert flights >= 4 * NUM  # most of them part from the pad more than once
 
 
-def test_states_equal_those_of_c_mujoco_until_shortly_after_the_first_touch(
-    bodies: list[objects.Body], drops: physics.Trajectory, engine: physics.Engine
-) -> None:
+def test_states_equal_those_of_c_mujoco_until_shortly_after_the_first_touch(bodies, drops, engine):
     steps = round(1 / SCENARIO.rate / SCENARIO.contact.timestep)
     before, after = [], []
     for row in range(4 * NUM):
@@ -170,7 +160,7 @@ def test_states_equal_those_of_c_mujoco_until_shortly_after_the_first_touch(
 
 
 @pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
-def test_a_drawn_model_equals_a_freshly_compiled_one(scale: float) -> None:
+def test_a_drawn_model_equals_a_freshly_compiled_one(scale):
     constants = physics.Contact()
     model, like, _ = scene.template(PAD, constants)
     model = copy.copy(model)
@@ -211,20 +201,13 @@ CALM = jnp.tile(jnp.array([0, 0, -G]), (3, 100, 1))
 
 
 @pytest.mark.slow
-def test_contact_stiffness_does_not_depend_on_mass() -> None:
+def test_contact_stiffness_does_not_depend_on_mass():
     light, heavy = (0.01 - float(ROLL(*block(mass), released(0.01), CALM)[0].qpos[2]) for mass in (0.01, 1.0))
     assert 0 < light < 1e-4
     np.testing.assert_allclose(light, heavy, rtol=0.05)
 
 
-def test_a_step_returns_the_structure_it_received() -> None:
-    state = released(0.01)
-    after = jax.eval_shape(roll.step, *block(0.1), state, jnp.zeros(3))
-    assert jax.tree.structure(after) == jax.tree.structure(state)
-    assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
-
-
-def test_later_gravity_leaves_frame_0_bit_identical() -> None:
+def test_later_gravity_leaves_frame_0_bit_identical():
     shaken = CALM.at[1:, :, 0].set(5.0)
     (_, a), (_, b) = (ROLL(*block(0.1), released(0.01), gravity) for gravity in (CALM, shaken))
     assert bool(a.contact[0])
@@ -232,16 +215,14 @@ def test_later_gravity_leaves_frame_0_bit_identical() -> None:
     assert not np.array_equal(a.pose[2], b.pose[2])
 
 
-def test_gravity_may_change_with_time() -> None:
+def test_gravity_may_change_with_time():
     gravity = jnp.zeros((3, 100, 3)).at[0, :10, 1].set(3.0)
     _, record = ROLL(*block(0.1), released(1.0), gravity)
     speed = 3.0 * 10 * physics.Contact().timestep
     np.testing.assert_allclose(record.velocity[:, :3], [[0, speed, 0]] * 3, atol=1e-6)
 
 
-def test_trajectories_are_reproducible_whatever_their_number_and_the_progress_bar(
-    bodies: list[objects.Body], drops: physics.Trajectory, engine: physics.Engine, capsys: pytest.CaptureFixture
-) -> None:
+def test_trajectories_are_reproducible_whatever_their_number_and_the_progress_bar(bodies, drops, engine, capsys):
     again = physics.simulate(
         jax.random.key(3), bodies[:1], Sensor(), SCENARIO, 3, chunk=24, progress=True, engine=engine
     )
@@ -253,9 +234,7 @@ def test_trajectories_are_reproducible_whatever_their_number_and_the_progress_ba
         np.testing.assert_array_equal(getattr(again, name), getattr(drops, name)[:3])
 
 
-def test_given_hidden_values_keep_the_starts_and_nothing_is_printed_by_default(
-    bodies: list[objects.Body], drops: physics.Trajectory, engine: physics.Engine, capsys: pytest.CaptureFixture
-) -> None:
+def test_given_hidden_values_keep_the_starts_and_nothing_is_printed_by_default(bodies, drops, engine, capsys):
     hidden = jax.tree.map(lambda x: x[:NUM], drops.hidden)
     heavy = hidden._replace(fill=np.append(hidden.fill[:1], np.ones(NUM - 1, np.float32)))
     other = physics.simulate(
@@ -267,9 +246,7 @@ def test_given_hidden_values_keep_the_starts_and_nothing_is_printed_by_default(
     assert not np.any(np.all(other.pose[1:, -1] == drops.pose[1:NUM, -1], axis=1))
 
 
-def test_given_starts_and_hidden_values_repeat_trajectories_of_another_key(
-    bodies: list[objects.Body], drops: physics.Trajectory, engine: physics.Engine
-) -> None:
+def test_given_starts_and_hidden_values_repeat_trajectories_of_another_key(bodies, drops, engine):
     start = physics.Start(drops.pose[:NUM, 0], jnp.asarray(SCENARIO.steps), drops.condition[:NUM])
     hidden = jax.tree.map(lambda x: x[:NUM], drops.hidden)
     again = physics.simulate(
@@ -283,7 +260,7 @@ def test_given_starts_and_hidden_values_repeat_trajectories_of_another_key(
     assert not np.any(np.all(other.pose[:, -1] == drops.pose[:NUM, -1], axis=1))
 
 
-def test_objects_that_leave_the_pad_are_frozen(bodies: list[objects.Body], engine: physics.Engine) -> None:
+def test_objects_that_leave_the_pad_are_frozen(bodies, engine):
     scenario = dataclasses.replace(SCENARIO, spread=0.15)
     drops = physics.simulate(jax.random.key(0), bodies[2], Sensor(), scenario, 24, chunk=24, engine=engine)
     fell = np.asarray(drops.outcome) == physics.Outcome.FELL_OFF
@@ -296,7 +273,7 @@ def test_objects_that_leave_the_pad_are_frozen(bodies: list[objects.Body], engin
 
 
 @pytest.mark.slow
-def test_objects_compile_once(bodies: list[objects.Body]) -> None:
+def test_objects_compile_once(bodies):
     physics.simulate(jax.random.key(3), bodies[0], Sensor(), SCENARIO, 1, chunk=24, engine="mjx")
     before = engines.roll_worlds._cache_size()
     more = [objects.make(jax.random.key(20), "spoon"), objects.make(jax.random.key(21), "mouse")]
@@ -305,9 +282,7 @@ def test_objects_compile_once(bodies: list[objects.Body]) -> None:
 
 
 @pytest.mark.slow
-def test_progress_and_resampling(
-    bodies: list[objects.Body], drops: physics.Trajectory, engine: physics.Engine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_progress_and_resampling(bodies, drops, engine, monkeypatch):
     sunk = drops.sunk[:NUM]
     limit = float(np.sort(sunk)[-2] + np.sort(sunk)[-1]) / 2
     monkeypatch.setattr(simulation, "SUNK_LIMIT", limit)
@@ -326,102 +301,13 @@ def test_progress_and_resampling(
         physics.simulate(jax.random.key(3), bodies[0], Sensor(), SCENARIO, 1, chunk=24, engine=engine)
 
 
-def test_the_outcome_of_a_fall_follows_from_the_last_pose() -> None:
+def test_the_outcome_of_a_fall_follows_from_the_last_pose():
     first = jnp.array([0, 0, 0.1, 1, 0, 0, 0])
     assert int(SCENARIO.outcome(first, first.at[2].set(0.001))) == physics.Outcome.RESTS
     assert int(SCENARIO.outcome(first, first.at[2].set(-0.02))) == physics.Outcome.FELL_OFF
 
 
-@pytest.mark.parametrize(
-    ("change", "num", "match"),
-    [
-        ({}, 0, "num is 0"),
-        ({"friction": (-0.1, 0.5)}, 1, r"scenario.friction"),
-        ({"friction": (0.0, 0.5)}, 1, r"scenario.friction"),
-        ({"shell_scale": (1.1, 0.9)}, 1, r"scenario.shell_scale"),
-        ({"fill": (0.0, 1.5)}, 1, r"scenario.fill"),
-        ({"height": float("nan")}, 1, r"scenario.height"),
-        ({"tilt": -0.1}, 1, r"scenario.tilt"),
-        ({"rate": 30.0}, 1, "rate is 30"),
-        ({"frames": 0}, 1, r"scenario.frames"),
-        (
-            {"frames": 1},
-            1,
-            r"scenario.frames is 1, so a trajectory lasts 0 s, .* 0.05 m .* at least 0.301 s .* at least 11 frames",
-        ),
-        ({"height": 1000.0}, 1, r"scenario.frames is 60, so a trajectory lasts 1.89 s, .* 1000 m .* at least 14.5 s"),
-    ],
-)
-def test_errors_name_fields_out_of_range(bodies: list[objects.Body], change: dict, num: int, match: str) -> None:
-    with pytest.raises(ValueError, match=match):
-        physics.simulate(jax.random.key(0), bodies[0], Sensor(), dataclasses.replace(SCENARIO, **change), num)
-
-
-@pytest.mark.parametrize(
-    ("change", "match"),
-    [
-        ({"shell_mass": jnp.float32(-0.1)}, "body 1: shell_mass is -0.1"),
-        ({"shell_mass": jnp.float32(jnp.nan)}, "body 1: shell_mass is nan"),
-        ({"hulls": jnp.full((1, 64, 3), jnp.nan)}, "body 1: the field `hulls` has a vertex that is not finite"),
-        ({"hulls": jnp.zeros((1, 64, 3))}, "body 1: the collision hull spans no volume"),
-        ({"hulls": jnp.zeros((3, 64, 3))}, "body 1: hulls has shape"),
-        ({"vertices": jnp.full((1024, 3), jnp.nan)}, r"body 1: vertices has values that are not finite \(3,072 of"),
-        ({"category": jnp.int32(99)}, "body 1: category is 99, but it must be -1"),
-        ({"shell_inertia": -jnp.eye(3), "contents_density": jnp.float32(0)}, "body 1: principal moments"),
-    ],
-)
-def test_errors_name_bodies_with_bad_values(bodies: list[objects.Body], change: dict, match: str) -> None:
-    bad = dataclasses.replace(bodies[1], **change)
-    with pytest.raises(ValueError, match=match):
-        physics.simulate(jax.random.key(0), [bodies[0], bad], Sensor(), SCENARIO)
-
-
-def test_the_fewest_frames_that_are_allowed_let_an_object_settle() -> None:
-    dataclasses.replace(SCENARIO, frames=11).check()
-    with pytest.raises(ValueError, match=r"scenario.frames is 10"):
-        dataclasses.replace(SCENARIO, frames=10).check()
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "wanted"),
-    [
-        ("frames", 59.5, "a whole number"),
-        ("frames", True, "a whole number"),
-        ("frames", "60", "a whole number"),
-        ("height", "0.05", "a number"),
-        ("rate", False, "a number"),
-        ("fill", [0.0, 1.0], "a tuple of two numbers"),
-        ("fill", (0.0, "1"), "a tuple of two numbers"),
-        ("contact", 0.001, r"a physics\.Contact"),
-    ],
-)
-def test_errors_name_fields_of_another_kind(field: str, value: object, wanted: str) -> None:
-    scenario = physics.Freefall()
-    object.__setattr__(scenario, field, value)  # past the tests' own checks of types
-    with pytest.raises(ValueError, match=rf"scenario\.{field} is .*it must be {wanted}"):
-        scenario.check()
-
-
-@pytest.mark.parametrize(
-    ("changes", "match"),
-    [
-        ({"body": "bottle.obj"}, r"body 0 is 'bottle\.obj', but it must be a Body: .*objects\.load"),
-        ({"sensor": None}, "sensor is None, but it must be a Sensor"),
-        ({"scenario": "freefall"}, r"scenario is 'freefall', but it must be Freefall\(\)"),
-        ({"scenario": physics.Freefall}, r"scenario is <class .*Freefall'>, but it must be Freefall\(\)"),
-        ({"key": 0}, r"key is 0, but it must be a JAX key, such as jax\.random\.key\(0\)"),
-        ({"num": 1.5}, "num is 1.5, but it must be a whole number"),
-        ({"chunk": 0}, "chunk is 0, but it must be a whole number"),
-        ({"progress": "bar"}, "progress is 'bar', but it must be True, False or a function"),
-    ],
-)
-def test_errors_name_arguments_of_another_type(bodies: list[objects.Body], changes: dict, match: str) -> None:
-    given = {"key": jax.random.key(0), "body": bodies[0], "sensor": Sensor(), "scenario": SCENARIO, "num": 1}
-    with pytest.raises((TypeError, ValueError), match=match):
-        inspect.unwrap(physics.simulate)(**given | changes)
-
-
-def test_outcomes_print_as_words_and_a_trajectory_prints_as_a_summary(drops: physics.Trajectory) -> None:
+def test_outcomes_print_as_words_and_a_trajectory_prints_as_a_summary(drops):
     assert len(drops.outcomes) == 4 * NUM
     assert all(isinstance(outcome, physics.Outcome) for outcome in drops.outcomes)
     np.testing.assert_array_equal(drops.outcomes, drops.outcome)
@@ -430,63 +316,10 @@ def test_outcomes_print_as_words_and_a_trajectory_prints_as_a_summary(drops: phy
     text = "24 trajectories of 4 bodies, 60 frames in 1.89 s; 22 rests, 2 fell off; 1 not settled at the end"
     assert repr(ended) == f"Trajectory({text})"
     assert repr(jax.tree.map(lambda x: x[0], ended)).startswith("Trajectory(1 trajectory of 1 body, 60 frames")
+    assert "pose=(24, 60, 7)" in repr(jax.eval_shape(lambda x: x, drops))
 
 
-def test_a_traced_trajectory_prints_its_shapes(drops: physics.Trajectory) -> None:
-    seen: list[str] = []
-    jax.jit(lambda x: seen.append(repr(x)))(drops)
-    jax.vmap(lambda x: seen.append(repr(x)))(drops)
-    seen += [repr(jax.eval_shape(lambda x: x, drops)), repr(jax.tree.map(np.shape, drops))]
-    assert ["pose=(24, 60, 7)" in text for text in seen] == [True, False, True, True]
-    assert "pose=(60, 7)" in seen[1]
-
-
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
-        ({"pose": np.zeros((3, 7))}, r"start\.pose has shape \(3, 7\), but it must be \(2, 7\)"),
-        ({"pose": np.zeros((2, 7))}, r"start\.pose has quaternions whose length is not 1"),
-        ({"pose": np.full((2, 7), np.nan)}, r"start\.pose has values that are not finite"),
-        ({"condition": np.zeros((2, 1))}, r"start\.condition has shape \(2, 1\), but it must be \(2, 0\)"),
-        ({"held": np.array(-1)}, r"start\.held is -1, but each value must be an integer >= 0 \(time steps\)"),
-        (
-            {"held": np.zeros(3, int)},
-            r"start\.held has shape \(3,\), but it must be one number or have the shape \(2,\)",
-        ),
-        (
-            {"carried": np.array(1.5)},
-            r"start\.carried has the smallest value 1\.5 and the largest value 1\.5, but each value must be",
-        ),
-    ],
-)
-def test_errors_name_bad_starts(bodies: list[objects.Body], changed: dict, message: str) -> None:
-    pose = np.tile(np.float32([0, 0, 0.1, 1, 0, 0, 0]), (2, 1))
-    start = physics.Start(pose, np.array(0), np.zeros((2, 0), np.float32))._replace(**changed)
-    with pytest.raises(ValueError, match=message):
-        physics.simulate(jax.random.key(0), bodies[0], Sensor(), SCENARIO, 2, start=start)
-
-
-def test_errors_name_bad_hidden_values(bodies: list[objects.Body]) -> None:
-    good = physics.Hidden(np.ones(2), np.ones(2), np.ones(2), np.tile(np.float32([0, 0, 1]), (2, 1)))
-    with pytest.raises(ValueError, match=r"hidden.fill has shape \(2,\)"):
-        physics.simulate(jax.random.key(0), bodies[0], Sensor(), SCENARIO, 3, hidden=good)
-    with pytest.raises(ValueError, match=r"hidden.friction has the value -1.0, but it must be > 0"):
-        physics.simulate(
-            jax.random.key(0), bodies[0], Sensor(), SCENARIO, 2, hidden=good._replace(friction=-np.ones(2))
-        )
-    with pytest.raises(ValueError, match=r"hidden.up has rows that are not unit vectors"):
-        physics.simulate(jax.random.key(0), bodies[0], Sensor(), SCENARIO, 2, hidden=good._replace(up=np.ones((2, 3))))
-    with pytest.raises(ValueError, match=r"hidden.up has shape \(2, 2\)"):
-        physics.simulate(jax.random.key(0), bodies[0], Sensor(), SCENARIO, 2, hidden=good._replace(up=np.eye(2)))
-    with pytest.raises(ValueError, match=r"hidden.fill has the smallest value 0.0 and the largest value 1.5"):
-        physics.simulate(
-            jax.random.key(0), bodies[0], Sensor(), SCENARIO, 2, hidden=good._replace(fill=np.array([0, 1.5]))
-        )
-    with pytest.raises(ValueError, match="no body"):
-        physics.simulate(jax.random.key(0), [], Sensor(), SCENARIO)
-
-
-def test_further_starts_are_independent_of_simulated_ones_and_of_their_number(bodies: list[objects.Body]) -> None:
+def test_further_starts_are_independent_of_simulated_ones_and_of_their_number(bodies):
     key, two = jax.random.key(3), bodies[:2]
     one = physics.starts(key, two, Sensor(), SCENARIO, 3)
     assert one.pose.shape == (6, 7)
@@ -498,11 +331,9 @@ def test_further_starts_are_independent_of_simulated_ones_and_of_their_number(bo
     drawn = physics.simulate(key, two, Sensor(), SCENARIO, 3, engine="mujoco")
     for further, own in ((one.pose, drawn.pose[:, 0]), (one.hidden.fill, drawn.hidden.fill)):
         assert np.abs(np.asarray(further)[:, None] - np.asarray(own)[None]).reshape(36, -1).max(1).min() > 1e-4
-    with pytest.raises(ValueError, match="num is 0"):
-        physics.starts(key, two, Sensor(), SCENARIO, 0)
 
 
-def test_mass_properties_of_draws_equal_those_of_single_bodies(bodies: list[objects.Body]) -> None:
+def test_mass_properties_of_draws_equal_those_of_single_bodies(bodies):
     drawn = physics.starts(jax.random.key(5), bodies[:2], Sensor(), SCENARIO, 9).hidden
     which = np.repeat([0, 1], 9)
     found = physics.rigids(bodies[:2], which, drawn)

@@ -1,11 +1,10 @@
 """Motion of objects on the pad, simulated in MuJoCo (`simulate`), and poses of objects at rest (`place`)."""
 
-from sts_jax.physics.bodies import BodyError, refusal
-from sts_jax.physics.draws import Starts, starts
+from sts_jax.physics.bodies import BodyError, Rigid, refusal, rigids
 from sts_jax.physics.engines import Engine
+from sts_jax.physics.forces import wrench
 from sts_jax.physics.freefall import Freefall
 from sts_jax.physics.inclined import Inclined
-from sts_jax.physics.mass_properties import Rigid, rigids
 from sts_jax.physics.perturbed import Perturbed
 from sts_jax.physics.released import Released
 from sts_jax.physics.rest import Placement, StableFaces, place, stable_faces, weight
@@ -21,8 +20,7 @@ from sts_jax.physics.scenario import (
     variant,
 )
 from sts_jax.physics.scene import Contact
-from sts_jax.physics.simulation import simulate
-from sts_jax.physics.trajectory import Trajectory
+from sts_jax.physics.simulation import Starts, Trajectory, simulate, starts
 
 __all__ = [
     "BodyError",
@@ -53,4 +51,5 @@ __all__ = [
     "starts",
     "variant",
     "weight",
+    "wrench",
 ]

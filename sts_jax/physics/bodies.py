@@ -1,21 +1,26 @@
-"""Checks of the bodies of a simulation, and the geometry that collisions and random starts need."""
+"""Bodies of a simulation: their checks, mass properties, collision hulls, and the geometry that random starts need."""
 
+import concurrent.futures
 import math
+import os
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Float, Int
 
 from sts_jax import objects
 from sts_jax.objects.body import Body
 from sts_jax.physics import contact
 from sts_jax.physics.contact import Hull
-from sts_jax.physics.mass_properties import rigid_of_draws
 from sts_jax.physics.rest import UPRIGHT, StableFaces
-from sts_jax.physics.scenario import Scenario, Shape
+from sts_jax.physics.scenario import Hidden, Scenario, Shape
 
 CONTENTS = 16  # random contents of each body, whose centres of mass a scenario with `by_contents` receives
+AT_ONCE = 8  # draws whose mass properties one call computes
+
+rigid_of_draws = jax.jit(jax.vmap(objects.rigid, in_axes=(None, 0, 0, 0)))  # one body, several draws
 
 
 class BodyError(ValueError):
@@ -31,27 +36,20 @@ class BodyError(ValueError):
 
 
 def check_bodies(bodies: Sequence[Any]) -> None:
-    """Raise an error unless every item is a `Body` that can be simulated.
-
-    Raises:
-        TypeError: An item is not a `Body`.
-        BodyError: `hulls` has an unsupported shape or a non-finite value, `shell_mass` is not positive and finite, or
-            `Body.check` finds an error.
-    """
+    """Raise a TypeError or a BodyError unless every item is a `Body` that can be simulated."""
     for i, body in enumerate(bodies):
         if not isinstance(body, Body):
-            raise TypeError(
-                f"body {i} is {body!r}, but it must be a Body: objects.make generates one, objects.load reads a mesh "
-                "file. For several bodies, pass a sequence"
-            )
-        known = body.hulls.ndim == 3 and body.hulls.shape[1] in objects.HULL_CLASSES
-        if not known or body.hulls.shape[0] not in objects.PART_CLASSES:
+            raise TypeError(f"body {i} is {body!r}, but it must be a Body, from objects.make or objects.load")
+        if (
+            body.hulls.ndim != 3
+            or body.hulls.shape[1:] not in [(size, 3) for size in objects.HULL_CLASSES]
+            or (body.hulls.shape[0] not in objects.PART_CLASSES)
+        ):
             parts, points = (" or ".join(map(str, sizes)) for sizes in (objects.PART_CLASSES, objects.HULL_CLASSES))
             raise BodyError(
                 i,
                 f"hulls has shape {body.hulls.shape}, but it must be (p, n, 3) with p = {parts} convex parts of "
-                f"n = {points} points: make the body with objects.make or objects.load. For several bodies, pass a "
-                "sequence",
+                f"n = {points} points: for several bodies, pass a sequence",
             )
         if not np.isfinite(body.hulls).all():
             raise BodyError(i, "the field `hulls` has a vertex that is not finite: repair the mesh")
@@ -67,16 +65,42 @@ def check_bodies(bodies: Sequence[Any]) -> None:
             raise BodyError(i, str(error)) from error
 
 
-def refusal(body: Body, scenario: Scenario) -> str | None:
-    """Return the reason why a body cannot start in a scenario, or None if it can.
+class Rigid(NamedTuple):
+    """Mass properties and friction in n trajectories, float64."""
+
+    mass: Float[np.ndarray, "n"]  # Mass (kg).
+    com: Float[np.ndarray, "n 3"]  # Centre of mass in the mesh frame (m).
+    inertia: Float[np.ndarray, "n 3 3"]  # Inertia about the centre of mass, along the mesh axes (kg m^2).
+    friction: Float[np.ndarray, "n"]  # Coefficient of sliding friction against the pad.
+
+
+def rigids(bodies: Sequence[Body], which: Int[np.ndarray, "n"], hidden: Hidden) -> Rigid:
+    """Mass properties and friction of bodies with n sets of hidden properties (see `objects.rigid`).
 
     Args:
-        body: One body. The points of its hulls must span a volume.
-        scenario: Scenario in which the body is to start.
-
-    Returns:
-        A sentence about the body, such as "it rests on no face, because ...", or None.
+        bodies: All bodies.
+        which: Index of the body of each set, in ascending order.
+        hidden: The n sets.
     """
+    values = jax.tree.map(np.asarray, hidden)
+    groups = [np.flatnonzero(which == index) for index in np.unique(which)]
+    calls = [rows for group in groups for rows in np.split(group, range(AT_ONCE, len(group), AT_ONCE))]
+
+    def computed(rows: np.ndarray) -> list[np.ndarray]:
+        # Every call has the same number of draws, because another number would round differently and compile anew.
+        draws = Hidden(*(x[np.resize(rows, AT_ONCE)] for x in values))
+        rigid = rigid_of_draws(bodies[which[rows[0]]], draws.fill, draws.shell_scale, draws.up)
+        return [np.asarray(x)[: len(rows)] for x in (*rigid, draws.friction)]
+
+    # A call uses one core of a CPU. The first call compiles.
+    parts = [computed(rows) for rows in calls[:1]]
+    with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+        parts += pool.map(computed, calls[1:])
+    return Rigid(*(np.concatenate(leaves).astype(np.float64) for leaves in zip(*parts, strict=True)))
+
+
+def refusal(body: Body, scenario: Scenario) -> str | None:
+    """Return the reason why a body cannot start in a scenario, such as "it rests on no face, ...", or None."""
     return _refusal(_faces(body), scenario)
 
 
@@ -95,37 +119,21 @@ def _faces(body: Body) -> StableFaces:
 
 
 def hulls(bodies: Sequence[Body]) -> list[Hull]:
-    """Compute the collision hull of each body: vertices, edges and faces of its convex parts.
-
-    Raises:
-        BodyError: The points of a hull span no volume.
-    """
-    found = []
+    """Compute the collision hull of each body. A BodyError names one whose points span no volume."""
+    made = []
     for index, body in enumerate(bodies):
         try:
-            found.append(contact.hull(np.asarray(body.hulls)))
+            made.append(contact.hull(np.asarray(body.hulls)))
         except ValueError as error:
             raise BodyError(index, str(error)) from error
-    return found
+    return made
 
 
 def shapes(bodies: Sequence[Body], scenario: Scenario) -> Shape:
-    """Compute the geometry of each body, which the scenario needs to draw random initial poses.
-
-    Args:
-        bodies: Bodies that `check_bodies` accepts.
-        scenario: Scenario in which the bodies are to start.
-
-    Returns:
-        Arrays with a leading axis of bodies. Bodies can differ in the number of vertices and in the number of faces on
-            which they can rest. Shorter arrays are padded to the longest.
-
-    Raises:
-        BodyError: A body cannot start in the scenario.
-    """
+    """Compute the geometry of each body, with a leading axis of bodies. A BodyError names one that cannot start."""
     faces = [_faces(body) for body in bodies]
-    for index, own in enumerate(faces):
-        reason = _refusal(own, scenario)
+    for index, stable in enumerate(faces):
+        reason = _refusal(stable, scenario)
         if reason is not None:
             raise BodyError(index, f"{reason}: leave this body out")
     coms = np.stack([np.asarray(body.shell_com)[None] for body in bodies])
@@ -135,8 +143,8 @@ def shapes(bodies: Sequence[Body], scenario: Scenario) -> Shape:
         coms = np.stack([np.asarray(rigid_of_draws(body, *contents)[1]) for body in bodies])
     return Shape(
         points=_padded([np.asarray(body.hulls).reshape(-1, 3) for body in bodies], "edge"),
-        rests=_padded([own.up for own in faces], "edge"),
-        shares=_padded([own.share for own in faces], "constant"),
+        rests=_padded([stable.up for stable in faces], "edge"),
+        shares=_padded([stable.share for stable in faces], "constant"),
         coms=coms,
     )
 

@@ -1,23 +1,19 @@
 """Contacts of convex hulls with the top and the sides of a box: `collide` finds them and keeps a fixed number.
 
-MJX's own collision test of a mesh with a box is unsuitable here. MJX tests every edge of the mesh with every edge of
-the box. The edges of a small object on a large pad then have contacts with the distant rims of the pad. These contacts
-push the object. The object then never comes to rest, or is thrown off. MJX would also compile its test again for every
-mesh.
+MJX's own test of a mesh with a box compiles again for every mesh, and tests every edge of the mesh with every edge of
+the box. The edges of a small object on a large pad then have contacts with the distant rims of the pad, which push the
+object, so that it never comes to rest or is thrown off.
 
-The pad and the stop wall (as in `Inclined`) are boxes whose sides are parallel to the axes. The four edges of the top
-of a box are called its rims. The contacts of a convex hull with such a box can be of four kinds. This module computes
-three of these kinds:
+The pad and the stop wall are boxes with sides parallel to the axes. The four edges of the top of a box are called its
+rims. Of the four possible kinds of contacts, this module computes three:
 
 - A vertex of the hull lies inside the box. The vertex is pushed out through the nearest of the top and the four sides.
 - An edge of the hull crosses a rim. The edge is pushed along the common normal of edge and rim, or upwards if this
   normal points into the box.
 - A corner of the top lies inside the hull. The hull is pushed along the normal of the nearest lower face of the hull.
 
-The distance of each contact is exact along its normal. The fourth kind is left out: an edge of the hull crosses one of
-the four vertical edges of the box. Only objects that have fallen off the pad meet these vertical edges. Such an object
-can penetrate a vertical edge without a contact. The file `tests/test_physics_contact.py` compares the contacts that
-this module finds with those that C MuJoCo finds for a mesh.
+The distance of each contact is exact along its normal. The fourth kind, an edge of the hull that crosses a vertical
+edge of the box, is left out: only objects that have fallen off the pad meet these edges.
 """
 
 from typing import NamedTuple
@@ -37,12 +33,9 @@ SKIN = 0.001  # m, points up to this height above the deepest one can be contact
 
 
 class Hull(NamedTuple):
-    """The p convex parts of an object in the mesh frame.
+    """The p convex parts of an object in the mesh frame, padded by repetition to h vertices, e edges and f faces each.
 
-    The arrays of each part have room for h vertices, e edges and f triangular faces. If a part has fewer than h
-    vertices, the last vertex of the part is repeated, so that all parts have arrays of the same size. The same holds
-    for parts with fewer than e edges or f faces. The last axis of each array runs over the vertices, edges or faces of
-    a part, because XLA vectorises along the last axis.
+    The last axis of each array runs over the vertices, edges or faces, because XLA vectorises along it.
     """
 
     vertices: Float[Array | np.ndarray, "*n 3 p h"]  # m
@@ -51,10 +44,9 @@ class Hull(NamedTuple):
 
 
 class Contacts(NamedTuple):
-    """k contact points of an object with the pad or the stop wall, with fields as in MuJoCo's `mjContact`.
+    """k contact points of an object with a box, with fields as in MuJoCo's `mjContact`.
 
-    The pad and the stop wall are boxes. The points that `collide` returns are in the frame of the box, whose origin is
-    the centre of its top. The caller of `scene.step` must convert them to the sensor frame.
+    `collide` returns them in the frame of the box's top, and `scene.step` takes them in the sensor frame.
     """
 
     dist: Float[Array, "k"]  # m, negative for penetration, 1 where there is no contact
@@ -63,16 +55,9 @@ class Contacts(NamedTuple):
 
 
 def hull(parts: np.ndarray) -> Hull:
-    """Compute the vertices, edges and face planes of p convex parts.
+    """Hull of p convex parts, (p, n, 3) (m), padded to n vertices, 3 n - 6 edges and 2 n - 4 faces per part.
 
-    The result is padded to n vertices, 3 n - 6 edges and 2 n - 4 faces per part, where n is the number of points
-    of each part.
-
-    Args:
-        parts: n points of each of the p parts, (p, n, 3) (m). Repeated points have no effect.
-
-    Raises:
-        ValueError: The points of a part span no volume.
+    Repeated points have no effect. Raises a ValueError if the points of a part span no volume.
     """
     return jax.tree.map(lambda *x: np.stack(x, axis=-2), *(_part(part) for part in parts))
 
@@ -81,14 +66,12 @@ def _part(vertices: np.ndarray) -> Hull:
     """Compute the vertices, edges and face planes of one part. The arrays lack the axis of parts."""
     points = np.asarray(vertices, np.float64)
     try:
-        found = ConvexHull(points)
+        convex = ConvexHull(points)
     except QhullError as error:
-        raise ValueError(
-            "the collision hull spans no volume: give each convex part at least four points that are not in one plane"
-        ) from error
-    sides = np.sort(found.simplices[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        raise ValueError("the collision hull spans no volume: the points of a convex part are in one plane") from error
+    sides = np.sort(convex.simplices[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     edges = points[np.unique(sides, axis=0)]
-    planes = found.equations * [1, 1, 1, -1]
+    planes = convex.equations * [1, 1, 1, -1]
 
     def pad(x: np.ndarray, count: int) -> np.ndarray:
         padded = np.concatenate([x, np.repeat(x[-1:], count - len(x), axis=0)])
@@ -149,10 +132,9 @@ def _crossing(ends: Float[Array, "2 3 e"], half: Float[Array, "2"], axis: int, s
 
 
 def _through_top(edges: _Crossing, half: Float[Array, "2"], axis: int, sign: float) -> Bool[Array, "e"]:
-    """Return for each edge whether it entered the box through the top and not through a side.
+    """Whether each edge entered the box through the top and not through a side.
 
-    It entered through the top in three cases. The inner end of the edge lies above the box, or inside the box and
-    nearer to the top than to a side, or beyond the far side of the box.
+    It did if its inner end lies above the box, inside it and nearer to the top than to a side, or beyond its far side.
     """
     inner = edges.inner
     cut = jnp.abs(sign * half[axis] - inner[axis])
@@ -162,13 +144,7 @@ def _through_top(edges: _Crossing, half: Float[Array, "2"], axis: int, sign: flo
 
 
 def _rim_normal(along: Float[Array, "3 e"], axis: int, sign: float) -> Float[Array, "3 e"]:
-    """Compute for each edge the unit vector perpendicular to the edge and to the rim.
-
-    Args:
-        along: Direction of each edge.
-        axis: Horizontal axis perpendicular to the rim, 0 or 1.
-        sign: Side of the box along this axis, 1 or -1.
-    """
+    """Unit vector perpendicular to each edge (direction `along`) and to the rim on a side (`sign`) of an axis."""
     across, up = along[2], -along[axis]
     length = jnp.sqrt(across**2 + up**2)
     scale = jnp.where(up < 0, -1.0, 1.0) / jnp.where(length > 0, length, 1.0)
@@ -191,7 +167,7 @@ def _rim(ends: Float[Array, "2 3 e"], half: Float[Array, "2"], axis: int, sign: 
 
 def _corners(planes: Float[Array, "4 f"], half: Float[Array, "2"]) -> _Candidates:
     """Find the corners of the top inside a convex part. The normal is that of the nearest of the part's lower faces."""
-    found = []
+    corners = []
     for x, y in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
         corner = jnp.stack([x * half[0], y * half[1], jnp.zeros(())])
         inside = planes[3] - corner[0] * planes[0] - corner[1] * planes[1]
@@ -199,20 +175,14 @@ def _corners(planes: Float[Array, "4 f"], half: Float[Array, "2"]) -> _Candidate
         nearest = jnp.argmin(below)
         depth = jnp.where(jnp.all(inside > 0), below[nearest], -1.0)
         normal = -planes[:3, nearest]
-        found.append(_Candidates(depth, corner - depth * normal, normal))
-    return jax.tree.map(lambda *x: jnp.stack(x, axis=-1), *found)
+        corners.append(_Candidates(depth, corner - depth * normal, normal))
+    return jax.tree.map(lambda *x: jnp.stack(x, axis=-1), *corners)
 
 
 def _spread(depth: Float[Array, "c"], across: Float[Array, "2 c"], num: int) -> Int[Array, "k"]:
     """Choose `num` contact points: the two deepest, over which the object tips, and the farthest in fixed directions.
 
-    Args:
-        depth: Depth of each candidate (m).
-        across: Coordinates of each candidate in the plane in which the chosen points lie far apart (m).
-        num: Number of points.
-
-    Returns:
-        Indices of the chosen candidates. An index can occur more than once.
+    `across` are the coordinates (m) in which the points shall lie far apart. An index can occur more than once.
     """
     deepest = jnp.max(depth)
     candidate = depth > jnp.maximum(0, deepest - SKIN)
@@ -246,27 +216,22 @@ def collide(
     num: int = PAD_CONTACTS,
     plane: tuple[int, int] = (0, 1),
 ) -> Contacts:
-    """Find the contacts between an object and a box. The top of the box is centred at the origin.
+    """Find the contacts between an object and a box whose top is centred at the origin.
 
-    There is a candidate for each vertex of the object inside the box, for each edge of the object that enters the box
-    through the top and leaves it through a side, and for each corner of the top inside the object. A candidate can
-    become a contact if its depth is above 0 and above the largest depth minus 1 mm (`SKIN`).
-
-    The first contact is the deepest candidate. The second contact is the deepest of the candidates that are more than
-    1 mm (`APART`) away from the first contact. For each of `num` - 2 evenly spaced directions, the candidate with the
-    largest score is a contact, unless it is a contact already. The score of a candidate is its coordinate along the
-    direction plus `STEEP` (5) times its depth. Distances and directions are measured in `plane`.
+    A candidate can become a contact if its depth is above 0 and above the largest depth minus `SKIN`. The first contact
+    is the deepest candidate. The second is the deepest that is more than `APART` away from the first. For each of
+    `num` - 2 evenly spaced directions, the candidate with the largest coordinate along it plus `STEEP` times its depth
+    is a contact, unless it is one already.
 
     Args:
         body: Convex parts of the object.
-        pose: Mesh frame in the frame of the box's top, (7,): position (m), quaternion (w, x, y, z).
-        half: Half the size of the box along x and y, (2,) (m). The box has its top at z = 0 and is infinitely deep.
+        pose: Mesh frame in the frame of the box's top.
+        half: Half the size of the box along x and y (m). It is infinitely deep.
         num: Number of contacts, >= 2.
-        plane: Indices of the two axes along which distances and directions are measured, such as (0, 1) for x and y.
+        plane: The two axes along which distances and directions are measured.
 
     Returns:
-        `num` contacts in the frame of the box's top. Their field `dist` is minus the depth. If the object has fewer
-            contacts, `dist` of the remaining entries is 1 m.
+        `num` contacts in the frame of the box's top. `dist` is 1 m where there is none.
     """
     rotation, place = geometry.quat_to_matrix(pose[3:]), pose[:3, None]
     points = turned(rotation, jnp.reshape(body.vertices, (3, -1))) + place

@@ -13,13 +13,11 @@ from jaxtyping import Array, Float, Int
 
 from sts_jax.objects.body import Body
 from sts_jax.physics import native, scene
-from sts_jax.physics.bodies import BodyError
+from sts_jax.physics.bodies import BodyError, Rigid, rigids
 from sts_jax.physics.contact import Hull
-from sts_jax.physics.mass_properties import Rigid, rigids
 from sts_jax.physics.roll import Record, State, initial, roll
 from sts_jax.physics.scenario import Hidden, Scenario, Start
-from sts_jax.physics.scene import Contact
-from sts_jax.physics.solver import mjx
+from sts_jax.physics.scene import Contact, mjx
 
 COMPILED = 64  # largest number of bodies whose compiled models are kept for C MuJoCo
 
@@ -38,7 +36,7 @@ class Setup(NamedTuple):
 
 
 class Rolled(NamedTuple):
-    """Results of one or more trajectories: the final values, and a record of every frame."""
+    """Results of one or more trajectories."""
 
     ends: State | native.Ends
     record: Record
@@ -61,51 +59,24 @@ class Worlds(NamedTuple):
 def gravity_at(
     condition: Float[Array | np.ndarray, "n c"], time: Float[Array, "f s"], scenario: Scenario
 ) -> Float[Array, "n f s 3"]:
-    """Compute the gravity in each time step of n trajectories.
-
-    Args:
-        condition: Condition of each trajectory, (n, c), as described by `Scenario.quantities`.
-        time: Start time of each step (s), as an array (f, s) for f frames of s steps.
-        scenario: Scenario whose `gravity` is called.
-
-    Returns:
-        Gravity minus the acceleration of the pad, (n, f, s, 3) (m/s^2, sensor frame).
-    """
+    """`Scenario.gravity` in each time step of n trajectories."""
     return jax.vmap(lambda c: jax.vmap(jax.vmap(lambda t: scenario.gravity(t, c)))(time))(condition)
 
 
 @functools.partial(jax.jit, static_argnames="scenario")
 def velocity_of(condition: Float[Array | np.ndarray, "n c"], scenario: Scenario) -> Float[Array, "n 6"]:
-    """Compute the velocity of the object on its release in each of n trajectories.
-
-    Args:
-        condition: Condition of each trajectory, (n, c), as described by `Scenario.quantities`.
-        scenario: Scenario whose `velocity` is called.
-
-    Returns:
-        Linear and angular velocity of each object on its release, (n, 6) (m/s, rad/s, sensor frame).
-    """
+    """`Scenario.velocity` of n trajectories."""
     return jax.vmap(scenario.velocity)(jnp.asarray(condition))
 
 
 @jax.jit
 def roll_worlds(worlds: Worlds, model: mjx.Model, data: mjx.Data) -> Rolled:
-    """Simulate n trajectories in MJX.
-
-    Args:
-        worlds: Starts, hulls and gravity of the trajectories. The arrays of all hulls must have the same shapes.
-        model: Model of the scene (`scene.template`). For each trajectory, some fields of this model are replaced by the
-            values in `worlds.fields`.
-        data: Data of the same scene.
-
-    Returns:
-        Results with a leading axis of n.
-    """
+    """Simulate n trajectories in MJX with the scene of `scene.template`, whose `worlds.fields` are replaced."""
 
     def one(world: Worlds) -> Rolled:
-        own = model.tree_replace(world.fields)
+        drawn = model.tree_replace(world.fields)
         state = initial(world.start.pose, world.velocity, world.start.held)
-        return Rolled(*roll(own, data, world.hull, state, world.gravity))
+        return Rolled(*roll(drawn, data, world.hull, state, world.gravity))
 
     return jax.vmap(one)(worlds)
 
@@ -118,24 +89,9 @@ def drawn_fields(
     constants: Contact,
     wall: float,
 ) -> dict[str, np.ndarray]:
-    """Compute the fields of MJX's model that depend on mass properties and friction.
+    """Fields of MJX's model that depend on the hidden properties, by name, with a leading axis of n draws.
 
-    The fields are computed for each of n draws of hidden properties. `scene.set_rigid` writes the mass properties and
-    the friction of a draw into a model of C MuJoCo. The values of the fields are then read from this model.
-
-    Args:
-        bodies: All bodies.
-        which: Index of the body of each draw, (n,).
-        hidden: Hidden properties of each draw, with a leading axis of n.
-        pad: Size of the pad along x and y (m).
-        constants: Contact and solver constants.
-        wall: Height of the stop wall (m), 0 for none.
-
-    Returns:
-        The fields by name, with a leading axis of n.
-
-    Raises:
-        BodyError: The mass properties or the friction of a draw are out of range.
+    They are read from a model of C MuJoCo, which derives them from the mass properties and the friction of each draw.
     """
     original, like, _ = scene.template(pad, constants, wall)
     model = copy.copy(original)
@@ -157,22 +113,7 @@ def _set_rigid(model: mujoco.MjModel, data: mujoco.MjData, body: int, rigid: Rig
 
 
 def in_mjx(setup: Setup, starts: Start, hidden: Hidden, chunk: int) -> Run:
-    """Return a function that simulates some of n trajectories in MJX.
-
-    Args:
-        setup: Bodies, scenario, pad and time steps of all n trajectories.
-        starts: Starts of all n trajectories.
-        hidden: Hidden properties of all n trajectories.
-        chunk: Largest number of trajectories in a call of the returned function.
-
-    Returns:
-        Function that takes the indices of at most `chunk` trajectories and returns their results. Within one call,
-            the bodies of these trajectories must have hulls whose arrays have the same shapes. The shapes may differ
-            between calls.
-
-    Raises:
-        BodyError: The mass properties or the friction of a body are out of range.
-    """
+    """Return a function that simulates trajectories in MJX, at most `chunk` in a call, all of one size class."""
     scenario = setup.scenario
     _, model, data = scene.template(setup.pad, scenario.contact, scenario.wall)
     fields = drawn_fields(setup.bodies, setup.which, hidden, setup.pad, scenario.contact, scenario.wall)
@@ -193,18 +134,7 @@ def in_mjx(setup: Setup, starts: Start, hidden: Hidden, chunk: int) -> Run:
 
 
 def in_c(setup: Setup, starts: Start, hidden: Hidden, chunk: int) -> Run:
-    """Return a function that simulates some of n trajectories in C MuJoCo.
-
-    Args:
-        setup: Bodies, scenario, pad and time steps of all n trajectories.
-        starts: Starts of all n trajectories.
-        hidden: Hidden properties of all n trajectories.
-        chunk: Largest number of trajectories in a call of the returned function.
-
-    Returns:
-        Function that takes the indices of at most `chunk` trajectories of one body and returns their results. It raises
-            a BodyError if the mass properties or the friction of the body are out of range.
-    """
+    """Return a function that simulates trajectories in C MuJoCo, at most `chunk` in a call, all of one body."""
     bodies, scenario = setup.bodies, setup.scenario
     rigid = rigids(bodies, setup.which, hidden)
     starts = jax.tree.map(np.asarray, starts)

@@ -8,9 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from sts_jax import geometry
-from sts_jax.physics.limits import check_length
 from sts_jax.physics.roll import SLOW_TIME
-from sts_jax.physics.scenario import G, Outcome, Scenario, Shape, Start, fell_off, random_place
+from sts_jax.physics.scenario import G, Outcome, Scenario, Shape, Start, check_length, fell_off, random_place
 from sts_jax.physics.scene import Contact
 
 
@@ -18,12 +17,9 @@ from sts_jax.physics.scene import Contact
 class Freefall(Scenario):
     """An object is released in any orientation above the level pad. In frame 0 it is at rest in the air.
 
-    An object counts as settled after 0.2 s at rest. A trajectory must therefore last at least 0.2 s longer than the
-    fall to the pad: `(frames - 1) / rate >= sqrt(2 height / g) + 0.2 s`, with g = 9.81 m/s^2. `check` raises an error
-    for shorter trajectories. By default a trajectory lasts 1.9 s. Few objects still move at its end.
-
-    The random values of each trajectory, such as the friction, are drawn uniformly from the ranges that the fields of
-    this class define. Source: the See-Through-your-Skin paper, section "Data Collection".
+    A trajectory must last for the fall and the 0.2 s in which an object settles:
+    `(frames - 1) / rate >= sqrt(2 height / g) + 0.2 s`. All values are drawn uniformly from the ranges of the fields.
+    Source: the See-Through-your-Skin paper, section "Data Collection".
     """
 
     symmetries = tuple(range(8))
@@ -43,23 +39,19 @@ class Freefall(Scenario):
     contact: Contact = dataclasses.field(default_factory=lambda: Contact(0.001, width=0.00005, rolling=0.002))
 
     def check(self) -> None:
-        """Raise a ValueError if a field has a value of the wrong type or out of range. The message names the field.
-
-        For example, `frames` is too small if a trajectory ends before an object can fall and come to rest.
-        """
+        """See `Scenario.check`."""
         super().check()
         check_length("height", self.height)
         check_length("spread", self.spread)
         lasts, needed = (self.frames - 1) / self.rate, math.sqrt(2 * self.height / G) + SLOW_TIME
         if lasts < needed:
             raise ValueError(
-                f"scenario.frames is {self.frames}, so a trajectory lasts {lasts:.3g} s, but an object released "
-                f"{self.height:g} m above the pad needs at least {needed:.3g} s to fall and come to rest: give at "
-                f"least {math.ceil(needed * self.rate) + 1} frames or a smaller height"
+                f"scenario.frames is {self.frames} ({lasts:.3g} s), but a fall from {self.height:g} m to rest lasts "
+                f"{needed:.3g} s: give at least {math.ceil(needed * self.rate) + 1} frames or a smaller height"
             )
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-        """Draw one start: a random place and orientation in the air. See `Scenario.start` for the arguments."""
+        """Draw a random place and orientation in the air."""
         del pad
         turn, radius, angle = jax.random.split(key, 3)
         quat = geometry.random_quat(turn)
@@ -67,16 +59,11 @@ class Freefall(Scenario):
         return Start(pose, jnp.asarray(self.steps), jnp.zeros(0))
 
     def gravity(self, time: Float[Array, ""], condition: Float[Array, "0"]) -> Float[Array, "3"]:
-        """Return the gravity on the level pad (m/s^2, sensor frame). It does not depend on the arguments."""
+        """Gravity on the level pad."""
         del time, condition
         return jnp.array([0.0, 0.0, -G])
 
     def outcome(self, first: Float[Array, "7"], last: Float[Array, "7"]) -> Int[Array, ""]:
-        """Return `FELL_OFF` if the object has left the pad in the last frame, else `RESTS`.
-
-        Args:
-            first: Pose in the first frame, (7,), simulated or predicted. It has no effect.
-            last: Pose in the last frame, (7,), simulated or predicted.
-        """
+        """`FELL_OFF` if the object has left the pad in the last frame, else `RESTS`."""
         del first
         return jnp.where(fell_off(last), Outcome.FELL_OFF, Outcome.RESTS).astype(jnp.int32)

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from sts_jax import geometry
-from sts_jax.physics.limits import check_length, check_range
 from sts_jax.physics.scenario import (
     LEVEL,
     MOVED,
@@ -20,6 +19,8 @@ from sts_jax.physics.scenario import (
     Scenario,
     Shape,
     Start,
+    check_length,
+    check_range,
     fell_off,
     random_yaw,
     upright,
@@ -33,20 +34,16 @@ CLEARANCE = 0.001  # m, smallest distance of a start on the slope from the stop 
 
 @dataclasses.dataclass(frozen=True)
 class Inclined(Scenario):
-    """An object starts at rest on the tilted pad, or is released just above it. Downhill is +y.
+    """An object starts at rest on the tilted pad, or is released just above it. Downhill is +y, with a stop wall.
 
-    A stop wall stands at the lower edge of the pad. The contents of each object have settled earlier, in another,
-    random orientation of the object. The field `tilt` limits how far that orientation is from upright. On the slope,
-    the contents do not move inside the object, so the contents have the same place in the object in all frames. For a
-    start at rest, the centre of pressure in frame 0 reveals this place. The weight alone reveals little about this
-    place.
+    The contents have settled earlier in another, random orientation (`tilt`), and do not move on the slope. For a start
+    at rest, the centre of pressure in frame 0 reveals their place, and the weight alone reveals little.
 
     In most poses, the contents hardly matter: a flat object stays and a high object tips, wherever its contents lie.
-    For a start at rest, several random poses are therefore compared (the field `tries` is their number). The object
-    starts in the pose in which its contents have the largest influence on tipping.
+    A start at rest therefore has that one of several random poses in which the contents matter most for tipping.
 
-    The random values of each trajectory, such as the friction, are drawn uniformly from the ranges that the fields of
-    this class define. Source: the See-Through-your-Skin paper, section "Data Collection".
+    All values are drawn uniformly from the ranges of the fields. Source: the See-Through-your-Skin paper, section "Data
+    Collection".
     """
 
     symmetries = (0, 6)  # x -> -x
@@ -74,39 +71,26 @@ class Inclined(Scenario):
     by_contents: ClassVar[bool] = True
 
     def check(self) -> None:
-        """Raise a ValueError if a field has a value of the wrong type or out of range. The message names the field."""
+        """See `Scenario.check`."""
         super().check()
         if not 0 <= self.slope < math.pi / 2:
-            raise ValueError(
-                f"scenario.slope is {self.slope} rad, but it must be >= 0 and < pi / 2. "
-                "For an angle in degrees, use math.radians"
-            )
+            raise ValueError(f"scenario.slope is {self.slope} rad, but it must be >= 0 and < pi / 2: use math.radians")
         check_length("wall", self.wall)
         check_length("across", self.across)
         check_range("gap", self.gap, positive=False)
         if not (math.isfinite(sum(self.along)) and self.along[0] <= self.along[1]):
-            raise ValueError(
-                f"scenario.along is {self.along}, but it must be (low, high) with finite numbers and low <= high"
-            )
+            raise ValueError(f"scenario.along is {self.along}, but it must be finite (low, high) with low <= high")
         if self.tries < 1:
             raise ValueError(f"scenario.tries is {self.tries}, but it must be >= 1")
         if not 0 <= self.resting <= 1:
-            raise ValueError(
-                f"scenario.resting is {self.resting}, but it must be from 0 to 1 (share of the trajectories that start "
-                "at rest)"
-            )
+            raise ValueError(f"scenario.resting is {self.resting}, but it must be from 0 to 1")
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-        """Draw one start: a pose uphill of the stop wall, at rest on the pad or in the air.
+        """Draw a pose uphill of the stop wall, at rest on the pad or in the air.
 
-        See `Scenario.start` for the arguments.
-
-        For a start at rest, several random poses are drawn (the field `tries` is their number), and the best pose is
-        used. In a good pose, the amount and the place of the object's contents decide whether the object tips or stays.
-        Each pose is therefore tested with several random contents. The margin m of one test is the distance by which
-        the centre of mass, projected vertically onto the pad, lies inside the area that supports the object. The margin
-        is negative if the object tips. The best pose has the largest value of `min(mean(max(m, 0)), mean(max(-m, 0)))`,
-        with means over the tests of the pose.
+        At rest, the pose is that one of `tries` with the largest `min(mean(max(m, 0)), mean(max(-m, 0)))`. The means
+        are over random contents, and m is the distance by which the centre of mass, projected vertically onto the pad,
+        lies inside the area that supports the object (negative if the object tips).
         """
         kind, face, turn, free, gap, x, y = jax.random.split(key, 7)
         rests = jax.random.uniform(kind) < self.resting
@@ -131,20 +115,12 @@ class Inclined(Scenario):
         return Start(shape.above(place, geometry.quat_canonical(quat), height), held, jnp.zeros(0))
 
     def gravity(self, time: Float[Array, ""], condition: Float[Array, "0"]) -> Float[Array, "3"]:
-        """Return the gravity in the frame of the tilted pad (m/s^2). It does not depend on the arguments."""
+        """Gravity in the frame of the tilted pad."""
         del time, condition
         return G * jnp.array([0.0, math.sin(self.slope), -math.cos(self.slope)])
 
     def outcome(self, first: Float[Array, "7"], last: Float[Array, "7"]) -> Int[Array, ""]:
-        """Return the number of the outcome, given the poses (7,) of the first and the last frame.
-
-        The outcome is the first of these that applies:
-
-        - `FELL_OFF`, if the object has left the pad,
-        - `ROLLS`, if it has turned by more than 45 degrees about any axis,
-        - `SLIDES`, if it has moved by 10 mm or more along the pad,
-        - `STICKS`, in all other cases.
-        """
+        """`FELL_OFF`, else `ROLLS` (turned by more than 45 degrees), else `SLIDES` (by 10 mm or more), or `STICKS`."""
         same = jnp.abs(geometry.normalize(first[3:]) @ geometry.normalize(last[3:]))
         moved = geometry.norm(last[:2] - first[:2]) >= MOVED
         stays = jnp.where(moved, Outcome.SLIDES, Outcome.STICKS)
@@ -153,11 +129,7 @@ class Inclined(Scenario):
 
 
 def _margins(quat: Float[Array, "4"], shape: Shape, slope: float) -> Float[Array, "m"]:
-    """Compute the margin (m) by which an object with each centre of mass holds on a slope towards +y.
-
-    The vertical line through the centre of mass meets the pad at a point. The margin is the distance of this point from
-    the outline of the points that support the object. It is negative outside the outline, where the object tips.
-    """
+    """The margins m of `Inclined.start` (m) for each centre of mass of the object, on a slope towards +y."""
     rotation = geometry.quat_to_matrix(quat)
     points, coms = shape.points @ rotation.T, shape.coms @ rotation.T
     low = jnp.min(points[:, 2])

@@ -1,12 +1,9 @@
-"""Simulation of several trajectories of the same body in C MuJoCo, the engine for CPUs.
+"""Simulation of several trajectories of the same body in C MuJoCo, the engine for CPUs, as in `roll` for MJX.
 
-The results have the same meaning as those of MJX (`physics.roll`). In this module, the state of one trajectory in
-MuJoCo is called a world.
-
-The pad and the stop wall (as in the scenario `Inclined`) are fixed boxes. A tiny sphere at each vertex of the object's
-hull collides with them, so every vertex can be a contact point, as in `physics.contact`. Without these spheres, MuJoCo
-would keep only four contacts of a mesh that stands on a face, and a round base would act like a square base. The mesh
-itself also collides, because the rims of the pad and the stop wall touch the hull between its vertices.
+The state of one trajectory in MuJoCo is called a world. A tiny sphere at each vertex of the object's hull collides with
+the pad and the wall, so every vertex can be a contact point, as in `contact`. Without these spheres, MuJoCo would keep
+only four contacts of a mesh that stands on a face, and a round base would act like a square base. The mesh itself also
+collides, because the rims of the pad and the wall touch the hull between its vertices.
 """
 
 from collections.abc import Sequence
@@ -32,7 +29,7 @@ STILL_TURN = 0.02  # rad/s
 STILL_TIME = 0.5  # s
 
 FORCE = mujoco.mjtState.mjSTATE_XFRC_APPLIED  # the part of the state that the caller sets in every step
-# Columns of the sensor data.
+# Columns of the sensor data. A rollout runs without Python, so sensors measure what `forces.wrench` returns.
 _PAD, _WALL = slice(0, 9), slice(11, 17)  # pad: force, torque, position. Wall: force, torque
 _DEEPEST = slice(9, 11)  # > 0 if there is a contact, and the distance of the deepest one
 _SENSORS = """
@@ -47,10 +44,7 @@ _WALL_SENSOR = '<contact geom1="wall" subtree2="object" reduce="netforce" data="
 
 
 class Ends(NamedTuple):
-    """State at the end of n trajectories, such as whether the object has left the pad (`gone`).
-
-    Each field has the same meaning as the field of the same name in `roll.State`.
-    """
+    """State at the end of n trajectories, with fields as in `roll.State`."""
 
     gone: Bool[np.ndarray, "n"]
     slow: Int[np.ndarray, "n"]
@@ -60,7 +54,7 @@ class Ends(NamedTuple):
 
 
 class _Counts(NamedTuple):
-    """Counts that one block of frames passes to the next, in addition to MuJoCo's own state."""
+    """What one block of frames passes to the next besides MuJoCo's own state."""
 
     gone: Bool[np.ndarray, "n"]
     slow: Int[np.ndarray, "n"]
@@ -87,17 +81,7 @@ class _Steps(NamedTuple):
 def compile_body(
     parts: np.ndarray, pad: tuple[float, float], contact: scene.Contact, wall: float = 0.0
 ) -> mujoco.MjModel:
-    """Compile the scene for `roll`: pad, stop wall and object, with a contact point at each vertex in `parts`.
-
-    MuJoCo's contact sensors in the scene measure the contact forces and the depth of the deepest contact.
-
-    Args:
-        parts: Vertices of the p convex parts that represent the object in collisions, n vertices for each part,
-            (p, n, 3), in the mesh frame (m).
-        pad: Size of the pad along x and y (m).
-        contact: Contact and solver constants.
-        wall: Height of the stop wall (m), 0 for none.
-    """
+    """Compile `scene.compile_scene` with contact sensors, and with a contact point at each vertex in `parts`."""
     sensors = _SENSORS.format(wall=_WALL_SENSOR if wall else "")
     spec = mujoco.MjSpec.from_string(scene.scene_xml(parts, pad, contact, wall).replace("</mujoco>", sensors))
     owner = spec.body("object")
@@ -118,10 +102,7 @@ def _run(before: Int[np.ndarray, "n"], holds: Bool[np.ndarray, "n t"]) -> Int[np
 def _gone(qpos: Float[np.ndarray, "n t 7"], points: Float[np.ndarray, "h 3"], lowest: float) -> Int[np.ndarray, "n"]:
     """Find the first step after which the whole object is GONE_DEPTH below the gel's face, t for none.
 
-    Args:
-        qpos: Pose after each step.
-        points: Vertices of the hull in the mesh frame (m).
-        lowest: Height of the mesh frame's origin above which the object cannot be so deep and is not tested (m).
+    An object whose origin is above `lowest` (m) cannot be so deep and is not tested.
     """
     low = qpos[..., 2] < lowest
     gone = np.zeros(low.shape, bool)
@@ -132,7 +113,7 @@ def _gone(qpos: Float[np.ndarray, "n t 7"], points: Float[np.ndarray, "h 3"], lo
 
 
 def _count(steps: _Steps, counts: _Counts, timestep: float) -> _Counts:
-    """Return the counts after some steps, given the counts before them."""
+    """The counts after some steps, from those before them."""
     speed, turn = (np.linalg.norm(steps.qvel[..., part], axis=-1) for part in (slice(3), slice(3, 6)))
     sensors, moving = steps.sensors, steps.moving
     touched = (np.any(sensors[..., _PAD], axis=-1) | np.any(sensors[..., _WALL], axis=-1)) & moving
@@ -200,22 +181,20 @@ def roll(
 ) -> tuple[Ends, Record]:
     """Simulate n independent trajectories of the same body, each from its start to its last frame.
 
-    A MuJoCo model has a constant gravity. This constant is set to the last gravity of the trajectory. In all time steps
-    with another gravity, the difference acts as a force on the object's centre of mass.
+    A MuJoCo model has a constant gravity: the last one of the trajectory. In time steps with another gravity, the
+    difference acts as a force on the object's centre of mass.
 
     Args:
-        models: Models of the n trajectories, each a copy of the result of `compile_body`. Their gravity is overwritten.
-        points: h vertices of the hull in the mesh frame, (h, 3) (m).
-        start: Starts of the n trajectories, with a leading axis of n.
-        gravity: Gravity in the s time steps that lead to each of the f frames, (n, f, s, 3) (m/s^2, sensor frame).
-        velocity: Velocity on release in the sensor frame, (n, 6): linear velocity of the mesh frame's origin (m/s) and
-            angular velocity (rad/s). None for objects at rest.
-        freeze: If True, an object is no longer simulated once it has been slower than 1 mm/s and 0.02 rad/s for 0.5 s
-            under constant gravity. It then keeps its pose and wrench, and its velocity becomes 0.
+        models: A copy of the result of `compile_body` for each trajectory. Their gravity is overwritten.
+        points: Vertices of the hull in the mesh frame (m).
+        start: Starts of the n trajectories.
+        gravity: Gravity in the s time steps that lead to each of the f frames (m/s^2, sensor frame).
+        velocity: Velocity on release in the sensor frame (m/s, rad/s). None for objects at rest.
+        freeze: True to end the simulation of an object that has been slower than 1 mm/s and 0.02 rad/s for 0.5 s under
+            constant gravity. It keeps its pose and wrench, and its velocity becomes 0.
 
     Returns:
-        Values at the end of each trajectory, such as whether the object has left the pad, and one record per trajectory
-        and frame.
+        The ends, and one record per trajectory and frame.
     """
     count, frames, steps, _ = gravity.shape
     worlds = _simulation(models, points, start, gravity, np.zeros((count, 6)) if velocity is None else velocity)
@@ -251,7 +230,7 @@ def _simulation(
     gravity: Float[np.ndarray, "n f s 3"],
     velocity: Float[np.ndarray, "n 6"],
 ) -> _Simulation:
-    """Create the worlds at their starts, with records of objects that stay there. See `roll` for the arguments."""
+    """Create the worlds at their starts, with records of objects that stay there."""
     count, frames, _, _ = gravity.shape
     mass = np.array([model.body("object").mass[0] for model in models])
     for model, pull in zip(models, gravity[:, -1, -1], strict=True):
@@ -288,18 +267,9 @@ def _simulation(
 def _advance(
     worlds: _Simulation, counts: _Counts, which: Int[np.ndarray, "k"], begin: int, end: int, per_frame: int
 ) -> _Counts:
-    """Simulate some worlds over several frames' intervals, and write their records.
+    """Simulate the worlds `which` from frame `begin` to `end` and write their records. Returns all counts.
 
-    Args:
-        worlds: All worlds.
-        counts: Counts of all worlds.
-        which: Indices of the worlds to simulate.
-        begin: First frame.
-        end: Frame after the last one.
-        per_frame: Number of steps to simulate at the end of each interval.
-
-    Returns:
-        Counts of all worlds, updated for the simulated ones.
+    `per_frame` is the number of steps to simulate at the end of each frame's interval.
     """
     steps = worlds.change.shape[2]
     push = np.zeros((len(which), (end - begin) * per_frame, 2, 6))
@@ -307,9 +277,9 @@ def _advance(
     worlds.batch.bind("xfrc_applied")[which] = 0
     control = push.reshape(*push.shape[:2], 12) if push.any() else None
     recorded = ("qpos", "qvel", "sensordata")
-    found = worlds.batch.rollout(push.shape[1], control, int(FORCE), record=recorded, ids=which)
-    qpos = found["qpos"]
-    rolled = _Steps(qpos, found["qvel"], found["sensordata"], _gone(qpos, worlds.points, worlds.lowest))
+    result = worlds.batch.rollout(push.shape[1], control, int(FORCE), record=recorded, ids=which)
+    qpos = result["qpos"]
+    rolled = _Steps(qpos, result["qvel"], result["sensordata"], _gone(qpos, worlds.points, worlds.lowest))
     for field, new in zip(worlds.records, _record(rolled, end - begin), strict=True):
         field[which, begin:end] = new
     after = _count(rolled, _Counts(*(x[which] for x in counts)), worlds.timestep)
@@ -327,7 +297,7 @@ def _keep(records: Record, end: int, ended: Int[np.ndarray, "k"], still: Int[np.
 
 
 def _finite(worlds: _Simulation) -> Bool[np.ndarray, "n"]:
-    """Return for each world whether MuJoCo gave no warning and all recorded poses and velocities are finite."""
+    """Whether MuJoCo gave no warning and all recorded poses and velocities are finite."""
     failed = worlds.batch.warning[..., 1].any(axis=1) | (worlds.batch.status != 0)
     pose, velocity = worlds.records.pose, worlds.records.velocity
     return ~failed & np.isfinite(pose).all(axis=(1, 2)) & np.isfinite(velocity).all(axis=(1, 2))

@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from sts_jax import geometry
-from sts_jax.physics.limits import check_length, check_range
 from sts_jax.physics.scenario import (
     MOVED,
     STANDING,
@@ -21,6 +20,8 @@ from sts_jax.physics.scenario import (
     Scenario,
     Shape,
     Start,
+    check_length,
+    check_range,
     fell_off,
     random_place,
     random_yaw,
@@ -29,21 +30,14 @@ from sts_jax.physics.scene import Contact
 
 
 class Jerk(NamedTuple):
-    """Acceleration of the pad in the scenario `Perturbed`, and the duration of this acceleration.
-
-    The acceleration is constant. It begins at frame 0.
-    """
+    """Constant acceleration of the pad that begins at frame 0."""
 
     acceleration: Float[Array | np.ndarray, "*n 2"]  # acceleration of the pad along x and y (m/s^2)
     duration: Float[Array | np.ndarray, "*n"]  # duration of the acceleration (s)
 
 
 def jerk(condition: Float[Array | np.ndarray, "*n 3"]) -> Jerk:
-    """Split each condition of the scenario `Perturbed` into the pad's acceleration and the acceleration's duration.
-
-    Args:
-        condition: Acceleration of the pad along x and y (m/s^2) and its duration (s), (..., 3).
-    """
+    """The jerk of a condition of `Perturbed`."""
     return Jerk(condition[..., :2], condition[..., 2])
 
 
@@ -51,15 +45,12 @@ def jerk(condition: Float[Array | np.ndarray, "*n 3"]) -> Jerk:
 class Perturbed(Scenario):
     """An object stands upright on the pad, which accelerates sideways for a short time and then keeps its velocity.
 
-    The short acceleration begins at frame 0. It is called a jerk, although it is not a derivative of the acceleration.
-    The condition of a trajectory contains the acceleration of the pad along x and y (m/s^2) and its duration (s). The
-    simulation runs in the frame of the pad, so the acceleration of the pad is subtracted from gravity.
+    The acceleration begins at frame 0 and is called a jerk, although it is not a derivative. The simulation runs in the
+    frame of the pad, so the acceleration is subtracted from gravity.
 
-    The default ranges of the fields are chosen for bottles, which can contain water. Bottles have a narrow base, so the
-    share of a bottle that is filled (`fill`) often decides whether it topples.
-
-    The random values of each trajectory, such as the friction, are drawn uniformly from the ranges that the fields of
-    this class define. Source: the See-Through-your-Skin paper, section "Data Collection".
+    The defaults are chosen for bottles, which can contain water: they have a narrow base, so `fill` often decides
+    whether they topple. All values are drawn uniformly from the ranges of the fields. Source: the See-Through-your-Skin
+    paper, section "Data Collection".
     """
 
     symmetries = tuple(range(8))
@@ -80,20 +71,14 @@ class Perturbed(Scenario):
     must_stand: ClassVar[bool] = True
 
     def check(self) -> None:
-        """Raise a ValueError if a field has a value of the wrong type or out of range. The message names the field."""
+        """See `Scenario.check`."""
         super().check()
         check_length("spread", self.spread)
         check_range("acceleration", self.acceleration, positive=False)
         check_range("duration", self.duration, positive=False)
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-        """Draw the start of one trajectory at random. The object stands with its +z up.
-
-        The field `condition` of the result has three random numbers: the acceleration of the pad along x and y (m/s^2),
-        and the duration of this acceleration (s).
-
-        See `Scenario.start` for the arguments.
-        """
+        """Draw a place and a jerk. The object stands with its +z up."""
         del pad
         turn, radius, angle, push, heading, time = jax.random.split(key, 6)
         pose = shape.above(random_place(radius, angle, self.spread), random_yaw(turn), -STANDING)
@@ -104,38 +89,19 @@ class Perturbed(Scenario):
         return Start(pose, jnp.asarray(0), condition)
 
     def gravity(self, time: Float[Array, ""], condition: Float[Array, "3"]) -> Float[Array, "3"]:
-        """Return gravity minus the acceleration of the pad (m/s^2, sensor frame).
-
-        See `Scenario.gravity` for the arguments. If the acceleration of the pad ends within the time step, the mean
-        acceleration over the time step is subtracted.
-        """
+        """Gravity minus the mean acceleration of the pad over the time step."""
         acceleration, duration = jerk(condition)
         step = self.contact.timestep
         share = jnp.clip((duration - time) / step, 0, 1) * (time > -step / 2)
         return jnp.append(-acceleration * share, -G)
 
     def drift(self, condition: Float[Array, "3"]) -> Float[Array, "2"]:
-        """Return the velocity of an object without friction, relative to the pad, after the pad has accelerated.
-
-        Args:
-            condition: Acceleration of the pad along x and y (m/s^2) and its duration (s), (3,).
-
-        Returns:
-            Velocity along x and y, (2,) (m/s). It is minus the acceleration times the duration.
-        """
+        """Velocity relative to the pad after the jerk: minus the acceleration times the duration."""
         acceleration, duration = jerk(condition)
         return jnp.asarray(-acceleration * duration)
 
     def outcome(self, first: Float[Array, "7"], last: Float[Array, "7"]) -> Int[Array, ""]:
-        """Return the number of the outcome, given the poses (7,) of the first and the last frame.
-
-        The outcome is the first of these that applies:
-
-        - `FELL_OFF`, if the object has left the pad,
-        - `TOPPLES`, if the z axis of its mesh leans by more than 45 degrees from the vertical in the last frame,
-        - `SLIDES`, if it has moved by 10 mm or more along the pad,
-        - `STANDS`, in all other cases.
-        """
+        """`FELL_OFF`, else `TOPPLES` (+z leans by more than 45 degrees), else `SLIDES` (10 mm or more), or `STANDS`."""
         leans = geometry.quat_to_matrix(geometry.normalize(last[3:]))[2, 2] < math.cos(TURNED)
         moved = geometry.norm(last[:2] - first[:2]) >= MOVED
         stays = jnp.where(moved, Outcome.SLIDES, Outcome.STANDS)

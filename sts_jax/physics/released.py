@@ -9,7 +9,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from sts_jax import geometry
-from sts_jax.physics.limits import check_length, check_range
 from sts_jax.physics.scenario import (
     LEVEL,
     STANDING,
@@ -19,6 +18,8 @@ from sts_jax.physics.scenario import (
     Scenario,
     Shape,
     Start,
+    check_length,
+    check_range,
     fell_off,
     random_place,
     random_yaw,
@@ -35,18 +36,16 @@ CLEARANCE = 0.002  # m, smallest distance between the points that touch the pad 
 class Released(Scenario):
     """A hand tilts an object about an edge of its bottom face, holds it tilted on the pad, and lets go at frame 0.
 
-    At one angle, the balance angle, the object would balance on the edge. The hand holds the object at a random angle
-    near the balance angle. From a smaller angle, the object returns to its bottom face. From a larger angle, it
-    topples. The balance angle depends on the place of the contents, which can lie anywhere in the object. Near the
-    balance angle, the contents therefore decide the outcome.
+    The hand holds the object near the angle at which it would balance on the edge. This angle depends on the place of
+    the contents, which can lie anywhere in the object. The contents therefore decide whether the object returns to its
+    face or topples.
 
-    In frame 0 the object is at rest. The pad carries a random share of the weight (`carried`). The hand carries the
-    rest of the weight and balances all moments. The wrench of the pad on the object in frame 0 is computed from the
-    held pose and this share (`held.held_wrench`). It does not depend on the motion after the release.
+    In frame 0 the object is at rest. The pad carries a random share of the weight (`carried`), and the hand carries the
+    rest and balances all moments. The wrench in frame 0 is computed from the held pose and this share
+    (`rest.held_wrench`), and does not depend on the motion after the release.
 
-    The random values of each trajectory, such as the friction, are drawn uniformly from the ranges that the fields of
-    this class define. Source: the See-Through-your-Skin paper, section "Real-World Dataset", where the object is a
-    small camera.
+    All values are drawn uniformly from the ranges of the fields. Source: the See-Through-your-Skin paper, section
+    "Real-World Dataset", where the object is a small camera.
     """
 
     symmetries = tuple(range(8))
@@ -76,47 +75,33 @@ class Released(Scenario):
     by_contents: ClassVar[bool] = True
 
     def check(self) -> None:
-        """Raise a ValueError unless the scenario can be simulated."""
+        """See `Scenario.check`."""
         super().check()
         check_length("spread", self.spread)
         if not 0 <= self.skew <= TURNED:
-            raise ValueError(
-                f"scenario.skew is {self.skew} rad, but it must be from 0 to pi / 4. For an angle in degrees, use "
-                "math.radians"
-            )
+            raise ValueError(f"scenario.skew is {self.skew} rad, but it must be from 0 to pi / 4: use math.radians")
         low, high = self.beyond
         if not -TURNED <= low <= high <= TURNED:
             raise ValueError(
                 f"scenario.beyond is {self.beyond} rad, but it must be (low, high) with -pi / 4 <= low <= high <= "
-                "pi / 4. For an angle in degrees, use math.radians"
+                "pi / 4: use math.radians"
             )
         check_range("carried", self.carried)
         if self.carried[1] > 1:
-            raise ValueError(
-                f"scenario.carried is {self.carried}, but it must be (low, high) with 0 < low <= high <= 1 (share of "
-                "the object's weight that the pad carries)"
-            )
+            raise ValueError(f"scenario.carried is {self.carried}, but it must have 0 < low <= high <= 1")
         if self.tries < 1:
             raise ValueError(f"scenario.tries is {self.tries}, but it must be >= 1")
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-        """Draw the pose in which the object is held, and the share of the object's weight that the pad carries.
+        """Draw the pose in which the object is held, and the share of the weight that the pad carries.
 
-        See `Scenario.start` for the arguments.
-
-        The object is held on an edge of one of its stable faces. The tilt is the angle between this face and the
-        horizontal. To choose the face and the edge, the method draws `tries` random edges of stable faces. An edge is
-        suitable if the object balances on it at a tilt of 15 to 45 degrees. The method takes the suitable edge at which
-        the balancing object has the lowest centre of mass. If no drawn edge is suitable, for example for a cylinder on
-        its side, the method takes the edge with the lowest centre of mass.
-
-        At an edge between two perpendicular faces, the released object turns by less than 45 degrees if it returns to
-        its face, and by more than 45 degrees if it topples onto the other face. The method `outcome` uses this
-        difference.
+        Of `tries` random edges of stable faces, those are suitable on which the object balances at a lean of 15 to 45
+        degrees. The object is held on the suitable edge with the lowest centre of mass in balance. If none is suitable,
+        as for a cylinder on its side, it is the lowest of all.
         """
         candidates, beyond, skew, radius, angle, share = jax.random.split(key, 6)
         keys = jax.random.split(candidates, self.tries)
-        edges = jax.lax.map(lambda own: _random_edge(own, shape), keys)  # one by one, to save memory
+        edges = jax.lax.map(lambda key: _random_edge(key, shape), keys)  # one by one, to save memory
         suitable = (edges.balance > FLAT) & (edges.balance < TURNED)
         chosen = jnp.argmin(jnp.where(suitable, edges.height, edges.height + 1.0))  # 1 m ranks other edges last
         edge = jax.tree.map(lambda x: x[chosen], edges)
@@ -140,23 +125,15 @@ class Released(Scenario):
         return Start(shape.above(place, quat, -STANDING), jnp.asarray(self.steps), jnp.zeros(0), carried)
 
     def gravity(self, time: Float[Array, ""], condition: Float[Array, "0"]) -> Float[Array, "3"]:
-        """Return the gravity on the level pad (m/s^2, sensor frame). It does not depend on the arguments."""
+        """Gravity on the level pad."""
         del time, condition
         return jnp.array([0.0, 0.0, -G])
 
     def outcome(self, first: Float[Array, "7"], last: Float[Array, "7"]) -> Int[Array, ""]:
-        """Return the number of the outcome, given the poses (7,) of the first and the last frame.
+        """`FELL_OFF`, else `TOPPLES` (turned by more than 45 degrees, but not about the vertical), or `RETURNS`.
 
-        The outcome is the first of these that applies:
-
-        - `FELL_OFF`, if the object has left the pad,
-        - `TOPPLES`, if it has turned by more than 45 degrees (turns about the vertical do not count),
-        - `RETURNS`, in all other cases.
-
-        The limit of 45 degrees suits most poses from `start`. In these poses, the object stands on the edge between two
-        of its faces, and the angle `a` between the narrower face and the pad is less than 45 degrees. Suppose that the
-        two faces are perpendicular. An object that returns to the narrower face turns by the angle `a`. An object that
-        topples onto the wider face turns by `90 degrees - a`, which is more than 45 degrees.
+        At an edge between two perpendicular faces, an object that leans by a < 45 degrees turns by a if it returns, and
+        by 90 degrees - a if it topples.
         """
         before, after = (geometry.quat_to_matrix(geometry.normalize(pose[3:]))[2] for pose in (first, last))
         stays = jnp.where(before @ after < math.cos(TURNED), Outcome.TOPPLES, Outcome.RETURNS)

@@ -1,4 +1,4 @@
-"""A body at rest on the flat pad: its stable faces, its pose, and the wrench that carries its weight."""
+"""A body at rest or held on the flat pad: its stable faces, its pose, and the wrench of the pad."""
 
 import math
 from typing import Literal, NamedTuple
@@ -9,13 +9,16 @@ import numpy as np
 from jaxtyping import Array, Float, ScalarLike
 from scipy.spatial.transform import Rotation
 
-from sts_jax import geometry, objects
+from sts_jax import geometry, objects, tactile
 from sts_jax.objects import Body
 from sts_jax.objects.body import is_traced
 from sts_jax.physics.scenario import STANDING, G
+from sts_jax.rendering.equilibrium import underside
 from sts_jax.sensor import Sensor
 
 UPRIGHT = math.radians(1)  # rad, largest lean of a body that counts as upright
+DEEPEST = 0.98  # largest depth of a held object, as a share of the gel's largest depth
+HALVINGS = 50  # bisection steps for the depth
 
 
 _rigid = jax.jit(objects.rigid)
@@ -31,7 +34,7 @@ class StableFaces(NamedTuple):
 
 
 class Placement(NamedTuple):
-    """Pose of a body at rest on the pad, and wrench of the pad on the body. Both are arguments of `sense`."""
+    """Pose of a body at rest on the pad, and wrench of the pad on it, for `sense`."""
 
     pose: Float[Array, "7"]  # Mesh frame in the sensor frame: position (m) and quaternion with w >= 0.
     wrench: Float[Array, "6"]  # Force (N) and moment about the sensor's origin (N m) of the pad on the body.
@@ -44,38 +47,27 @@ def stable_faces(
     shell_scale: float = 1.0,
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
 ) -> StableFaces:
-    """Find the faces of a body's convex hull on which the body can rest on a level plane.
+    """Find the faces of a body's convex hull on which it can rest on a level plane. Not under `jit`, `vmap` or `grad`.
 
-    The body rests on a face if its centre of mass lies above the face and at least 0.5 mm inside the outline of the
-    face. The function runs on the host and cannot be called under `jit`, `vmap` or `grad`.
+    The body rests on a face if its centre of mass lies above the face and at least 0.5 mm inside its outline.
 
     Args:
         body: One body.
-        fill: Share of the interior's volume that is filled, 0 to 1.
+        fill: Share of the interior's volume that is filled.
         shell_scale: Factor on the shell's mass.
         up: Direction that was up when the contents settled, as a unit vector in the mesh frame.
 
     Returns:
-        The stable faces, the most likely first. If the body cannot rest on any face, both arrays of `StableFaces` are
-        empty.
-
-    Raises:
-        TypeError: `body` is not a Body, or an argument is traced.
-        ValueError: The body has an invalid value (`Body.check`), or its hulls span no volume.
+        The stable faces, the most likely first. There may be none.
     """
     _check_body(body)
     if is_traced((body, fill, shell_scale, up)):
-        raise TypeError(
-            "`body`, `fill`, `shell_scale` or `up` is traced, but stable faces are computed on the host: call "
-            "`stable_faces` outside jit, vmap and grad"
-        )
+        raise TypeError("`body`, `fill`, `shell_scale` or `up` is traced: call this outside jit, vmap and grad")
     body.check()
     com = np.asarray(_rigid(body, fill, shell_scale, np.asarray(up, np.float32))[1], np.float64)
     points = np.unique(np.asarray(body.hulls, np.float64).reshape(-1, 3), axis=0)
     if np.linalg.matrix_rank(points - points[:1], tol=1e-6) < 3:
-        raise ValueError(
-            "the points of the body's hulls span no volume: give at least four points that are not in one plane"
-        )
+        raise ValueError("the points of the body's hulls span no volume: they are in one plane")
     ups, shares = objects.rest_poses(points, com)
     order = np.argsort(-shares, kind="stable")
     return StableFaces(ups[order], shares[order])
@@ -89,25 +81,10 @@ def weight(
     shell_scale: ScalarLike = 1.0,
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
 ) -> Float[Array, "6"]:
-    """Compute the wrench with which the level pad carries the weight of a body in a given pose.
+    """Wrench with which the level pad carries the weight of a body: m g (0, 0, 1, c_y, -c_x, 0).
 
-    With the mass m, gravity g and the centre of mass c in the sensor frame, the force is (0, 0, m g). Its moment about
-    the sensor's origin is c x (0, 0, m g) = (c_y m g, -c_x m g, 0). If `sense` receives the force without the moment,
-    the body tilts in the gel.
-
-    Args:
-        body: One body.
-        pose: Pose of the mesh frame in the sensor frame, (7,): position (m), quaternion (w, x, y, z).
-        fill: Share of the interior's volume that is filled, 0 to 1.
-        shell_scale: Factor on the shell's mass.
-        up: Direction that was up when the contents settled, as a unit vector in the mesh frame.
-
-    Returns:
-        Force (N) and moment about the sensor's origin (N m), (6,).
-
-    Raises:
-        TypeError: `body` is not a Body.
-        ValueError: The shape of `pose` is not (7,).
+    c is the centre of mass in the sensor frame. Without the moment, the body would tilt in the gel. `fill`,
+    `shell_scale` and `up` are those of `stable_faces`.
     """
     _check_body(body)
     mass, com, _ = _rigid(body, fill, shell_scale, jnp.asarray(up, jnp.float32))
@@ -127,33 +104,21 @@ def place(
     shell_scale: float = 1.0,
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
 ) -> Placement:
-    """Place a body at rest on the level pad, on one of its stable faces and under its own weight.
+    """Place a body at rest on the level pad under its own weight. Not under `jit`, `vmap` or `grad`.
 
-    The simulation treats the pad as almost rigid: an object at rest penetrates it by 0.01 mm. The body is placed at
-    this depth, so it stays at rest in a simulation from this pose. In contrast, `sense` treats the pad as a soft gel,
-    into which the body sinks deeper. `sense` computes this larger depth from the wrench that this function returns. The
-    function runs on the host and cannot be called under `jit`, `vmap` or `grad`.
+    The body is placed 0.01 mm deep, where it stays at rest in a simulation. `sense` computes its larger depth in the
+    soft gel from the returned wrench.
 
     Args:
         body: One body.
         sensor: Sensor whose `gel.size` is the size of the pad.
-        face: Index of a face in the result of `stable_faces` for the same `fill`, `shell_scale` and `up`. Face 0 is the
-            most likely one. "upright" is the face on which the body rests with its +z axis up.
+        face: Index of a face of `stable_faces` for the same `fill`, `shell_scale` and `up`, or "upright" for +z up.
         yaw: Rotation about the sensor's z axis (rad). At 0, the +z axis of a lying body points to the top of the image.
             If the body stands upright or upside down, its -y axis points there instead.
         position: x and y of the centre of the body's bounding box (m).
-        fill: Share of the interior's volume that is filled, 0 to 1.
-        shell_scale: Factor on the shell's mass, > 0.
-        up: Direction that was up when the contents settled, as a unit vector in the mesh frame. Placing the body
-            does not move the contents.
-
-    Returns:
-        Pose of the body, and wrench of the pad on the body.
-
-    Raises:
-        TypeError: An argument is traced, or `body` or `sensor` has the wrong type.
-        ValueError: The body has no stable face or cannot rest on `face`, its centre of mass does not lie above the pad,
-            or an argument is out of range or not finite.
+        fill: Share of the interior's volume that is filled.
+        shell_scale: Factor on the shell's mass.
+        up: Direction that was up when the contents settled, as a unit vector in the mesh frame.
     """
     _check_body(body)
     if not isinstance(sensor, Sensor):
@@ -178,27 +143,21 @@ def place(
     half = np.asarray(sensor.gel.size) / 2
     if not (np.abs(com) < half).all():
         raise ValueError(
-            f"position is {position} m, but the body would fall off, because its centre of mass would lie beyond the "
-            f"pad, at ({com[0]:.3f}, {com[1]:.3f}) m: give a position nearer to (0, 0), so that the centre of mass has "
-            f"|x| < {half[0]:g} m and |y| < {half[1]:g} m"
+            f"position is {position} m, but the body would fall off, because its centre of mass would lie at "
+            f"({com[0]:.3f}, {com[1]:.3f}) m: it must have |x| < {half[0]:g} m and |y| < {half[1]:g} m"
         )
     return Placement(pose, wrench)
 
 
 def _check_body(body: object) -> None:
     if not isinstance(body, Body):
-        raise TypeError(
-            f"body is {body!r:.60}, but it must be one Body: objects.make generates one, objects.load reads a mesh file"
-        )
+        raise TypeError(f"body is {body!r:.60}, but it must be one Body, from objects.make or objects.load")
 
 
 def _index(faces: StableFaces, face: int | str) -> int:
     count = len(faces.up)
     if not count:
-        raise ValueError(
-            "the body cannot rest on any of its faces. A body rests on a face if its centre of mass lies above the "
-            "face, at least 0.5 mm inside the face's outline. Give `sense` a pose of your own."
-        )
+        raise ValueError("the body cannot rest on any of its faces: give `sense` a pose of your own")
     numbers = f"faces 0 (the most likely) to {count - 1}" if count > 1 else "face 0 only"
     numbered = f"the body can rest on {numbers}"
     if isinstance(face, str):
@@ -227,11 +186,39 @@ def _check_numbers(
             wanted = "one finite number" if shape == () else f"{shape[0]} finite numbers"
             raise ValueError(f"{name} is {value!r}, but it must be {wanted}")
     if not 0 <= fill <= 1:
-        raise ValueError(f"fill is {fill}, but it must be from 0 to 1, as a share of the interior's volume")
+        raise ValueError(f"fill is {fill}, but it must be from 0 to 1")
     if not shell_scale > 0:
         raise ValueError(f"shell_scale is {shell_scale}, but it must be > 0")
     length = float(np.linalg.norm(np.asarray(up, float)))
     if abs(length - 1) > 1e-3:
-        raise ValueError(
-            f"`up` is {up!r}, which has the length {length:.6g}, but it must have the length 1: divide it by its length"
-        )
+        raise ValueError(f"`up` is {up!r} of length {length:.6g}, but it must have the length 1")
+
+
+def held_wrench(gel: tactile.Gel, body: Body, pose: Float[np.ndarray, "7"], force: float) -> Float[np.ndarray, "6"]:
+    """Wrench without friction on an object that a hand holds on the gel, so that it keeps its orientation.
+
+    The object sinks until the gel carries `force` (N), or until the gel allows no more (`Gel.max_depth`), as under a
+    sharp corner. The pressure in a cell of the gel's grid is `p = k max(0, d - h)`. Here k is `gel.stiffness`, d is the
+    depth of the object's lowest point, and h is the height of its underside above this point. `sense` computes the same
+    depth d from the wrench. The z of `pose` has no effect.
+    """
+    x, y = (np.asarray(part, np.float64) for part in tactile.cell_centres(gel))
+    heights = np.asarray(_heights(gel, body.vertices, body.faces, body.two_sided, jnp.asarray(pose)), np.float64)
+    if not np.isfinite(heights).any():
+        return np.zeros(6)
+    heights = heights - heights.min()
+    stiffness = float(gel.stiffness) * float(tactile.cell_area(gel))  # N/m of one cell
+    low, high = 0.0, DEEPEST * float(gel.max_depth)
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if stiffness * np.sum(np.maximum(middle - heights, 0)) < force else (low, middle)
+    push = stiffness * np.maximum(high - heights, 0)
+    return np.array([0.0, 0.0, np.sum(push), np.sum(push * y), -np.sum(push * x), 0.0])
+
+
+@jax.jit
+def _heights(
+    gel: tactile.Gel, vertices: Array, faces: Array, two_sided: Array, pose: Float[Array, "7"]
+) -> Float[Array, "r c"]:
+    """Height of the object's underside over each cell (m), `inf` where no face is in the gel's reach."""
+    return underside(gel, faces, two_sided, geometry.transform(pose, vertices), jnp.bool_(True))[0]

@@ -10,7 +10,8 @@ from jaxtyping import Array, Bool, Float, Int
 from sts_jax import geometry
 from sts_jax.physics import scene
 from sts_jax.physics.contact import PAD_CONTACTS, WALL_CONTACTS, Contacts, Hull, collide, turned
-from sts_jax.physics.solver import mjx
+from sts_jax.physics.forces import wrench
+from sts_jax.physics.scene import mjx
 
 # An object has settled if it has been slower than SLOW_SPEED and SLOW_TURN for SLOW_TIME.
 SLOW_SPEED = 0.005  # m/s
@@ -21,10 +22,7 @@ GONE_DEPTH = 0.01  # m, an object entirely this far below the gel's face has lef
 
 
 class State(NamedTuple):
-    """State of one trajectory: pose and velocity of the object, and counters such as the steps without contact.
-
-    Each time step computes a new state from the previous one.
-    """
+    """State of one trajectory between two time steps."""
 
     qpos: Float[Array, "7"]  # pose: position (m), quaternion
     qvel: Float[Array, "6"]  # m/s in the sensor frame, rad/s in the mesh frame (MuJoCo's free joint)
@@ -42,7 +40,7 @@ class State(NamedTuple):
 
 
 class Record(NamedTuple):
-    """State of the object in one frame: pose, velocity, wrench from the pad, and contact with pad and stop wall."""
+    """State of the object in one frame."""
 
     pose: Float[Array | np.ndarray, "*n 7"]  # position (m), quaternion with w >= 0
     velocity: Float[Array | np.ndarray, "*n 6"]  # m/s of the mesh frame's origin and rad/s, sensor frame
@@ -55,9 +53,9 @@ def initial(pose: Float[Array, "7"], velocity: Float[Array, "6"], held: Int[Arra
     """Create the state before the first time step.
 
     Args:
-        pose: Mesh frame in the sensor frame, (7,): position (m), quaternion.
-        velocity: Velocity on release in the sensor frame, (6,): linear (m/s) and angular (rad/s).
-        held: Number of time steps until the object is released.
+        pose: Mesh frame in the sensor frame.
+        velocity: Velocity on release in the sensor frame: m/s, rad/s.
+        held: Number of time steps until the release.
     """
     turn = velocity[3:] @ geometry.quat_to_matrix(pose[3:])
     zero = jnp.zeros((), jnp.int32)
@@ -86,7 +84,7 @@ class _Top(NamedTuple):
 
 
 def _tops(model: mjx.Model) -> list[_Top]:
-    """Return the top of the pad, and the top of the wall if there is one."""
+    """The top of the pad, and the top of the wall if there is one."""
     centre, half = model.geom_pos, model.geom_size
     fixed = np.flatnonzero(model.geom_bodyid == 0)
     return [_Top(centre[i] + jnp.zeros(3).at[2].set(half[i, 2]), half[i, :2]) for i in fixed]
@@ -94,16 +92,16 @@ def _tops(model: mjx.Model) -> list[_Top]:
 
 def _contacts(model: mjx.Model, hull: Hull, pose: Float[Array, "7"]) -> Contacts:
     """Find the contacts with the pad, followed by those with the wall if there is one."""
-    found = []
+    boxes = []
     kinds = ((PAD_CONTACTS, (0, 1)), (WALL_CONTACTS, (0, 2)))  # the pad lies in x y, the wall's face in x z
     for top, (num, plane) in zip(_tops(model), kinds, strict=False):
-        own = collide(hull, pose.at[:3].add(-top.centre), top.half, num, plane)
-        found.append(own._replace(pos=own.pos + top.centre))
-    return jax.tree.map(lambda *x: jnp.concatenate(x), *found)
+        contacts = collide(hull, pose.at[:3].add(-top.centre), top.half, num, plane)
+        boxes.append(contacts._replace(pos=contacts.pos + top.centre))
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *boxes)
 
 
 def _depth(points: Float[Array, "3 h"], model: mjx.Model) -> Float[Array, ""]:
-    """Return the depth (m) of the deepest point in the pad or the wall, 0 if all points are outside."""
+    """Depth (m) of the deepest point in the pad or the wall, 0 if all points are outside."""
     depths = []
     for top in _tops(model):
         x, y, z = points - top.centre[:, None]
@@ -112,24 +110,9 @@ def _depth(points: Float[Array, "3 h"], model: mjx.Model) -> Float[Array, ""]:
 
 
 def step(model: mjx.Model, data: mjx.Data, hull: Hull, state: State, gravity: Float[Array, "3"]) -> State:
-    """Advance a state by one time step.
+    """Advance a state by one time step under a gravity (m/s^2, sensor frame).
 
-    The field `wrenches` of the state accumulates the wrenches of the pad on the object. Each step adds its own wrench,
-    or sets the field to 0 if the pad does not push the object. The wrench of a step is the total over all contacts with
-    the pad, and its moment is about the sensor's origin. If the scene has a stop wall, contacts with the wall are not
-    part of the wrench.
-
-    An object that is held, or that has left the pad, does not move, and the field `wrenches` is 0.
-
-    Args:
-        model: Model of the scene in MJX. Its gravity is replaced.
-        data: Data of the scene in MJX. Its positions and velocities are replaced by those of `state`.
-        hull: Collision hull of the object.
-        state: State before the step.
-        gravity: Gravity during the step, (3,) (m/s^2, sensor frame).
-
-    Returns:
-        State after the step.
+    An object that is held, or that has left the pad, does not move, and its wrench is 0.
     """
     old = state
     model = model.tree_replace({"opt.gravity": gravity})
@@ -137,12 +120,10 @@ def step(model: mjx.Model, data: mjx.Data, hull: Hull, state: State, gravity: Fl
     contacts = _contacts(model, hull, old.qpos)
     new = scene.step(model, data, contacts)
 
-    push = scene.push(new, slice(0, PAD_CONTACTS))
-    rotation = geometry.quat_to_matrix(old.qpos[3:])
-    moment = rotation @ push[3:] + jnp.cross(old.qpos[:3], push[:3])
-    wrench = jnp.concatenate([push[:3], moment])
-    contact = jnp.any(push != 0)
-    wall = jnp.any(scene.push(new, slice(PAD_CONTACTS, len(contacts.dist))) != 0)
+    of_pad = wrench(model, new, "pad")
+    contact = jnp.any(of_pad != 0)
+    has_wall = len(contacts.dist) > PAD_CONTACTS
+    wall = jnp.any(wrench(model, new, "wall") != 0) if has_wall else jnp.zeros((), bool)
 
     points = turned(geometry.quat_to_matrix(new.qpos[3:]), jnp.reshape(hull.vertices, (3, -1))) + new.qpos[:3, None]
     timestep = model.opt.timestep
@@ -160,7 +141,7 @@ def step(model: mjx.Model, data: mjx.Data, hull: Hull, state: State, gravity: Fl
         touches=old.touches + begun,
         sunk=jnp.maximum(old.sunk, jnp.maximum(_depth(points, model), -jnp.min(contacts.dist))),
         finite=old.finite & jnp.all(jnp.isfinite(new.qpos)) & jnp.all(jnp.isfinite(new.qvel)),
-        wrenches=jnp.where(contact, old.wrenches + wrench, 0),
+        wrenches=jnp.where(contact, old.wrenches + of_pad, 0),
         loaded=jnp.where(contact, old.loaded + 1, 0),
         wall=wall,
     )
@@ -168,10 +149,7 @@ def step(model: mjx.Model, data: mjx.Data, hull: Hull, state: State, gravity: Fl
 
 
 def _unless_frozen(old: State, now: State) -> State:
-    """Return the state after a step, or the state before the step if the object is held or gone.
-
-    A held object keeps the velocity that it will have on its release.
-    """
+    """The state after a step, or the state before it if the object is held (it keeps its velocity) or gone."""
     nothing = jax.tree.map(jnp.zeros_like, old)
     frozen = old._replace(
         qvel=jnp.where(old.gone, nothing.qvel, old.qvel),
@@ -202,19 +180,9 @@ def roll(
     state: State,
     gravity: Float[Array, "frames steps 3"],
 ) -> tuple[State, Record]:
-    """Simulate one trajectory, which consists of intervals of equal length.
+    """Simulate one trajectory, and record a frame at the end of each interval of `steps` time steps.
 
-    An interval is a fixed number of time steps. One frame is recorded at the end of each interval.
-
-    Args:
-        model: Model of the scene in MJX.
-        data: Data of the scene in MJX.
-        hull: Collision hull of the object.
-        state: State at the beginning of the first interval.
-        gravity: Gravity in each time step of each interval, (frames, steps, 3) (m/s^2, sensor frame).
-
-    Returns:
-        The last state, and one record per frame.
+    `gravity` is in m/s^2 in the sensor frame. Returns the last state, and one record per frame.
     """
 
     def interval(state: State, gravity: Float[Array, "steps 3"]) -> tuple[State, Record]:

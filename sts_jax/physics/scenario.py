@@ -1,9 +1,10 @@
-"""The interface of scenarios: initial poses of objects, gravity that acts on them, and outcomes of trajectories."""
+"""What a scenario is: starts of objects, gravity that acts on them, outcomes, and the checks of its fields."""
 
 import abc
 import dataclasses
 import enum
 import math
+import numbers
 from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
 
 import jax
@@ -12,7 +13,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from sts_jax import geometry
-from sts_jax.physics.limits import check_kind, check_range
 from sts_jax.physics.scene import Contact
 
 G = 9.81  # m/s^2
@@ -24,10 +24,7 @@ STANDING = 1.04e-5  # m, depth in the pad of an object that stands or lies at re
 
 
 class Outcome(enum.IntEnum):
-    """The result of the motion in a trajectory, such as `TOPPLES` or `FELL_OFF`.
-
-    Each scenario uses some of the members. `str` returns words such as "fell off".
-    """
+    """The result of the motion in a trajectory. `str` returns words such as "fell off"."""
 
     RESTS = 0
     FELL_OFF = 1
@@ -43,12 +40,12 @@ class Outcome(enum.IntEnum):
 
 
 def in_words(outcome: enum.IntEnum) -> str:
-    """Return the name of an outcome in words, such as "fell off"."""
+    """The name of an outcome in words, such as "fell off"."""
     return outcome.name.lower().replace("_", " ")
 
 
 class Hidden(NamedTuple):
-    """Invisible properties of an object, such as its friction. Each property has one value per trajectory."""
+    """Hidden properties, with one value per trajectory."""
 
     fill: Float[Array, "*n"]  # Share of the interior's volume that is filled.
     shell_scale: Float[Array, "*n"]  # Mass of the shell over its nominal mass.
@@ -57,7 +54,7 @@ class Hidden(NamedTuple):
 
 
 class Shape(NamedTuple):
-    """Geometry of a body. A scenario needs it to draw random initial poses. Vectors are in the mesh frame."""
+    """Geometry of a body in the mesh frame, from which a scenario draws starts."""
 
     points: Float[Array | np.ndarray, "*n h 3"]  # Vertices of the convex parts (m), padded by repetition.
     rests: Float[Array | np.ndarray, "*n k 3"]  # Unit vector that points up on each stable face, padded by repetition.
@@ -67,25 +64,13 @@ class Shape(NamedTuple):
     def above(
         self, place: Float[Array, "2"], quat: Float[Array, "4"], height: Float[Array, ""] | float
     ) -> Float[Array, "7"]:
-        """Compute the pose of the body from its place, its orientation and the height of its lowest point.
-
-        Args:
-            place: x and y of the origin of the mesh frame (m).
-            quat: Orientation as a unit quaternion.
-            height: z of the lowest point (m). The gel's face is at 0.
-
-        Returns:
-            Mesh frame in the sensor frame, (7,), as position (m) and quaternion.
-        """
+        """Pose of the body from x and y of its origin (m), its orientation, and the height of its lowest point (m)."""
         lowest = jnp.min(self.points @ geometry.quat_to_matrix(quat)[2])
         return jnp.concatenate([place, jnp.stack([height - lowest]), quat])
 
 
 class Start(NamedTuple):
-    """The start of a trajectory: the initial pose, the time of release, and the condition.
-
-    The condition contains the numbers that `Scenario.quantities` describes, such as the acceleration of the pad.
-    """
+    """The start of a trajectory."""
 
     pose: Float[Array, "7"]  # Mesh frame in the sensor frame: position (m), quaternion.
     # Number of time steps for which the object is held, from the beginning of the interval that ends with frame 0. With
@@ -97,11 +82,7 @@ class Start(NamedTuple):
 
 
 class Quantity(NamedTuple):
-    """Description of a known quantity of trajectories, such as the acceleration of the pad.
-
-    The scenario samples the value for each trajectory, and predictors receive this value as an input. The value is a
-    number, or a vector (x, y) in the plane of the pad.
-    """
+    """Description of a quantity of the condition: a number, or a vector (x, y) in the plane of the pad."""
 
     name: str  # Name in texts and figures.
     unit: str  # Unit in texts and figures.
@@ -110,15 +91,12 @@ class Quantity(NamedTuple):
 
 
 class Scenario(abc.ABC):
-    """Base class of scenarios, which define the starts, the gravity and the outcomes of trajectories.
+    """Base class of scenarios.
 
     A scenario is a frozen dataclass that derives from this class. It defines `outcomes`, `start`, `gravity` and
-    `outcome`. All other members have defaults. To replace a default, the dataclass defines a class attribute, a field
-    or a method of the same name. `start`, `gravity`, `outcome`, `velocity`, `drift` and `hidden` are pure JAX functions
-    for one trajectory.
-
-    The condition of a trajectory is an array of c numbers that `start` draws, such as the acceleration of the pad.
-    `quantities` describes them. The condition is an input of predictors, besides the first frame.
+    `outcome`. All other members have defaults, which a class attribute, a field or a method of the same name replaces.
+    The methods from `start` to `drift`, and `hidden`, are pure JAX functions for one trajectory. Their argument
+    `condition` has the numbers of `quantities` in SI units.
     """
 
     # This is not a `typing.Protocol`. The command line calls `issubclass` to find the options of a scenario, and a
@@ -147,62 +125,27 @@ class Scenario(abc.ABC):
 
     @abc.abstractmethod
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-        """Draw the random start of one trajectory.
-
-        Args:
-            key: Random key that is used for nothing else.
-            shape: Geometry of the body.
-            pad: Size of the pad along x and y (m).
-
-        Returns:
-            Initial pose, time of release, and condition (the numbers that `quantities` describes).
-        """
+        """Draw the start of one trajectory on a pad of the given size along x and y (m)."""
 
     @abc.abstractmethod
     def gravity(self, time: Float[Array, ""], condition: Float[Array, "c"]) -> Float[Array, "3"]:
-        """Return gravity minus the acceleration of the pad during one time step (m/s^2, sensor frame).
+        """Gravity minus the acceleration of the pad in the time step from `time` on (s, 0 at frame 0).
 
-        Args:
-            time: Time at which the step begins (s), 0 at frame 0.
-            condition: Known quantities of the trajectory in SI units, such as an acceleration, (c,). The attribute
-                `quantities` describes them.
+        Returns:
+            m/s^2, sensor frame.
         """
 
     @abc.abstractmethod
     def outcome(self, first: Float[Array, "7"], last: Float[Array, "7"]) -> Int[Array, ""]:
-        """Return the outcome of one trajectory, as the integer value of a member of `outcomes`.
-
-        Args:
-            first: Pose in the first frame, (7,), simulated or predicted.
-            last: Pose in the last frame, (7,), simulated or predicted.
-        """
+        """Number of the outcome of one trajectory, from its first and last pose, simulated or predicted."""
 
     def velocity(self, condition: Float[Array, "c"]) -> Float[Array, "6"]:
-        """Return the velocity of the object on its release, by default 0.
-
-        Args:
-            condition: Known quantities of the trajectory in SI units, such as an acceleration, (c,). The attribute
-                `quantities` describes them.
-
-        Returns:
-            Velocity of the mesh frame's origin (m/s) and angular velocity (rad/s), (6,), in the sensor frame.
-        """
+        """Velocity of the object on its release: of its origin (m/s) and angular (rad/s), in the sensor frame."""
         del condition
         return jnp.zeros(6)
 
     def drift(self, condition: Float[Array, "c"]) -> Float[Array, "2"]:
-        """Return the velocity that an object without friction would have relative to the pad.
-
-        Figures draw this velocity as an arrow. Unless a subclass overrides this method, the result is the horizontal
-        velocity of the object on its release.
-
-        Args:
-            condition: Known quantities of the trajectory in SI units, such as an acceleration, (c,). The attribute
-                `quantities` describes them.
-
-        Returns:
-            Velocity along x and y, (2,) (m/s).
-        """
+        """Velocity along x and y that an object without friction would have relative to the pad (m/s), for figures."""
         return self.velocity(condition)[:2]
 
     @property
@@ -212,34 +155,21 @@ class Scenario(abc.ABC):
 
     @property
     def condition_scale(self) -> tuple[float, ...]:
-        """Typical magnitude of each number in a trajectory's condition, in SI units.
-
-        The condition contains the numbers that `quantities` describes, such as the acceleration of the pad.
-        """
+        """Typical magnitude of each number of the condition, in SI units."""
         return tuple(q.scale for q in self.quantities for _ in range(2 if q.vector else 1))
 
     @property
     def vectors(self) -> int:
-        """Number of vectors (x, y) among the known quantities of a trajectory, which are called its condition.
-
-        The field `quantities` lists the vectors and the scalars of the condition. The vectors come first.
-        """
+        """Number of vectors (x, y) at the beginning of the condition."""
         return sum(quantity.vector for quantity in self.quantities)
 
     @property
     def stays(self) -> tuple[enum.IntEnum, ...]:
-        """All members of `outcomes` except `Outcome.FELL_OFF`: the outcomes of objects that stay on the pad."""
+        """The outcomes of objects that stay on the pad."""
         return tuple(outcome for outcome in self.outcomes if outcome != Outcome.FELL_OFF)
 
     def named(self, number: int) -> str:
-        """Return the name of an outcome in words, such as "fell off".
-
-        Args:
-            number: Number of the outcome, as in `Trajectory.outcome`.
-
-        Raises:
-            ValueError: The scenario has no outcome with this number.
-        """
+        """The name of an outcome in words, such as "fell off", from its number."""
         names = {int(outcome): in_words(outcome) for outcome in self.outcomes}
         if number not in names:
             raise ValueError(
@@ -248,25 +178,16 @@ class Scenario(abc.ABC):
         return names[number]
 
     def described(self, condition: Float[Array | np.ndarray, "c"]) -> str:
-        """Describe a condition in words, such as "acceleration (3.1, -7.2) m/s², duration 0.085 s".
-
-        Args:
-            condition: Known quantities of a trajectory in SI units, such as an acceleration, (c,). The attribute
-                `quantities` describes them.
-        """
+        """Describe a condition in words, such as "acceleration (3.1, -7.2) m/s², duration 0.085 s"."""
         words, rest = [], np.asarray(condition).tolist()
         for quantity in self.quantities:
-            own, rest = (rest[:2], rest[2:]) if quantity.vector else (rest[:1], rest[1:])
-            values = ", ".join(f"{value:.3g}" for value in own)
+            part, rest = (rest[:2], rest[2:]) if quantity.vector else (rest[:1], rest[1:])
+            values = ", ".join(f"{value:.3g}" for value in part)
             words.append(f"{quantity.name} {f'({values})' if quantity.vector else values} {quantity.unit}")
         return ", ".join(words)
 
     def hidden(self, key: PRNGKeyArray) -> Hidden:
-        """Draw the hidden properties (friction, mass of the shell, and contents) of one trajectory.
-
-        Args:
-            key: Random key that is used for nothing else.
-        """
+        """Draw the hidden properties of one trajectory."""
         fill, shell, friction, high, around = jax.random.split(key, 5)
 
         def draw(key: PRNGKeyArray, limits: tuple[float, float]) -> Float[Array, ""]:
@@ -283,11 +204,7 @@ class Scenario(abc.ABC):
         )
 
     def check(self) -> None:
-        """Raise an error unless the scenario can be simulated.
-
-        Raises:
-            ValueError: A field has a value of the wrong type or out of range. The message names the field.
-        """
+        """Raise a ValueError that names a field of the wrong type or out of range."""
         _check_kinds(self)
         _check_times(self)
         _check_meanings(self)
@@ -295,14 +212,9 @@ class Scenario(abc.ABC):
         check_range("shell_scale", self.shell_scale)
         check_range("friction", self.friction)
         if self.fill[1] > 1:
-            raise ValueError(
-                f"scenario.fill is {self.fill}, but both limits must be from 0 to 1 (share of the interior's volume)"
-            )
+            raise ValueError(f"scenario.fill is {self.fill}, but both limits must be from 0 to 1")
         if not 0 <= self.tilt <= math.pi:
-            raise ValueError(
-                f"scenario.tilt is {self.tilt} rad, but it must be from 0 to pi. For an angle in degrees, use "
-                "math.radians"
-            )
+            raise ValueError(f"scenario.tilt is {self.tilt} rad, but it must be from 0 to pi: use math.radians")
 
 
 def _check_kinds(scenario: Scenario) -> None:
@@ -314,23 +226,60 @@ def _check_kinds(scenario: Scenario) -> None:
         elif field.default is not dataclasses.MISSING:
             defaults[field.name] = field.default
     for name, default in defaults.items():
-        check_kind(name, getattr(scenario, name), default)
+        _check_kind(name, getattr(scenario, name), default)
     for name, default in vars(Contact()).items():
-        check_kind(f"contact.{name}", getattr(scenario.contact, name), default)
+        _check_kind(f"contact.{name}", getattr(scenario.contact, name), default)
+
+
+def _check_kind(name: str, value: object, default: object) -> None:
+    """Raise a ValueError unless a value is a number, a whole number, two numbers or a `Contact` like its default."""
+    pair = isinstance(default, tuple) and len(default) == 2 and all(map(_is_number, default))
+    if isinstance(default, Contact):
+        fits, wanted = isinstance(value, Contact), "a physics.Contact"
+    elif pair:
+        fits = isinstance(value, tuple) and len(value) == 2 and all(map(_is_number, value))
+        wanted = "a tuple of two numbers (low, high) of a Python or NumPy type"
+    elif not _is_number(default):
+        return
+    elif isinstance(default, int):
+        fits = _is_number(value) and isinstance(value, numbers.Integral)
+        wanted = "a whole number of a Python or NumPy type"
+    else:
+        fits, wanted = _is_number(value), "a number of a Python or NumPy type"
+    if not fits:
+        raise ValueError(f"scenario.{name} is {value!r}, but it must be {wanted}")
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, numbers.Real) and not isinstance(value, bool | np.bool_)
+
+
+def check_range(name: str, values: tuple[float, float], *, positive: bool = True) -> None:
+    """Raise a ValueError unless a field is a range (low, high) of finite numbers with 0 < low (or 0 <= low) <= high."""
+    low, high = values
+    if not (math.isfinite(low) and math.isfinite(high) and low <= high and (low > 0 if positive else low >= 0)):
+        raise ValueError(
+            f"scenario.{name} is {values}, but it must be (low, high) with finite numbers and "
+            f"0 {'<' if positive else '<='} low <= high"
+        )
+
+
+def check_length(name: str, value: float) -> None:
+    """Raise a ValueError unless a field is a finite length >= 0 (m)."""
+    if not (math.isfinite(value) and value >= 0):
+        raise ValueError(f"scenario.{name} is {value} m, but it must be finite and >= 0")
 
 
 def _check_times(scenario: Scenario) -> None:
     """Raise a ValueError unless there is a frame, and the interval of a frame is a whole number of time steps."""
     rate, timestep = scenario.rate, scenario.contact.timestep
     if not rate > 0 or not timestep > 0:
-        raise ValueError(
-            f"scenario.rate is {rate}/s and scenario.contact.timestep is {timestep} s, but both must be > 0"
-        )
+        raise ValueError(f"scenario.rate is {rate}/s and scenario.contact.timestep is {timestep} s: both must be > 0")
     steps = 1 / (rate * timestep)
     if not (steps >= 1 and abs(steps - round(steps)) < 1e-6):
         raise ValueError(
-            f"scenario.rate is {rate}/s, which gives {steps:.3f} time steps (of {timestep} s) per frame, but the "
-            "number of time steps must be whole: choose another scenario.rate or scenario.contact.timestep"
+            f"scenario.rate is {rate}/s, which gives {steps:.3f} time steps (of {timestep} s) per frame: give a rate "
+            "or a contact.timestep for which the number is whole"
         )
     if scenario.frames < 1:
         raise ValueError(f"scenario.frames is {scenario.frames}, but it must be >= 1")
@@ -340,10 +289,7 @@ def _check_meanings(scenario: Scenario) -> None:
     """Raise a ValueError unless the numbers of the outcomes are unique and vectors come first in the condition."""
     numbers = [int(outcome) for outcome in scenario.outcomes]
     if int(Outcome.FELL_OFF) not in numbers:
-        raise ValueError(
-            f"scenario.outcomes is {scenario.outcomes}, but it must contain physics.Outcome.FELL_OFF, because any "
-            "object can leave the pad: add physics.Outcome.FELL_OFF"
-        )
+        raise ValueError(f"scenario.outcomes is {scenario.outcomes}: add physics.Outcome.FELL_OFF")
     taken = [o for o in scenario.outcomes if not isinstance(o, Outcome) and int(o) in {int(known) for known in Outcome}]
     if taken or len(set(numbers)) < len(numbers):
         raise ValueError(
@@ -353,10 +299,7 @@ def _check_meanings(scenario: Scenario) -> None:
     kinds = [quantity.vector for quantity in scenario.quantities]
     if sorted(kinds, reverse=True) != kinds:
         names = ", ".join(quantity.name for quantity in scenario.quantities)
-        raise ValueError(
-            f"scenario.quantities has the order {names}, but vectors must come before scalars: move the vectors to the "
-            "front"
-        )
+        raise ValueError(f"scenario.quantities has the order {names}, but vectors must come before scalars")
 
 
 Variant = Literal["default", "off", "wide-friction", "off-centre"]
@@ -368,18 +311,10 @@ def variant(scenario: _AnyScenario, name: str) -> _AnyScenario:
     """Return a copy of a scenario with other ranges of its hidden properties.
 
     Args:
-        scenario: Scenario to copy. Its other fields stay the same.
-        name: Name of the variant. "default" changes nothing. "off" fixes each hidden property at the middle of its
-            range, and the contents of an object lie at its base. "wide-friction" draws friction from 0.3 to 0.9.
-            "off-centre" sets `tilt` to pi. This field is the largest angle between the object's +z and the upward
-            direction while the contents settle. With pi, the object can have any orientation, so the contents can lie
-            at any side of the object, as in `Inclined()`.
-
-    Returns:
-        A scenario of the same class.
-
-    Raises:
-        ValueError: The name is unknown, or the scenario lacks a field that the variant changes.
+        scenario: Scenario to copy.
+        name: "default" changes nothing. "off" fixes each hidden property at the middle of its range, with the contents
+            at the base. "wide-friction" draws friction from 0.3 to 0.9. "off-centre" freezes the contents on any side
+            of the object (`tilt` = pi).
     """
     middle = {field: (sum(getattr(scenario, field)) / 2,) * 2 for field in _RANGES}
     changes: dict[str, dict[str, Any]] = {
@@ -392,20 +327,17 @@ def variant(scenario: _AnyScenario, name: str) -> _AnyScenario:
         raise ValueError(f"the name of the variant is {name!r}, but it must be one of {', '.join(changes)}")
     lacking = sorted(set(changes[name]) - {field.name for field in dataclasses.fields(scenario)})
     if lacking:
-        raise ValueError(
-            f"the variant {name!r} changes fields that the scenario {type(scenario).__name__} lacks: "
-            f"declare {', '.join(lacking)} in the scenario's dataclass"
-        )
+        raise ValueError(f"the variant {name!r} needs the fields {', '.join(lacking)} in {type(scenario).__name__}")
     return dataclasses.replace(scenario, **changes[name])
 
 
 def fell_off(pose: Float[Array, "*n 7"]) -> Bool[Array, "*n"]:
-    """Return for each pose, (..., 7), whether the object's origin is more than 5 mm below the face of the gel."""
+    """Whether the object's origin is more than 5 mm below the face of the gel."""
     return pose[..., 2] < FELL_OFF_HEIGHT
 
 
 def upright(up: Float[Array, "3"]) -> Float[Array, "4"]:
-    """Return the quaternion of the shortest rotation that turns a unit vector to +z."""
+    """Quaternion of the shortest rotation that turns a unit vector to +z."""
     upside_down = up[2] < -0.9999
     turn = jnp.stack([1 + up[2], up[1], -up[0], 0.0])
     return geometry.normalize(jnp.where(upside_down, jnp.array([0.0, 1.0, 0.0, 0.0]), turn))
@@ -418,13 +350,7 @@ def random_yaw(key: PRNGKeyArray) -> Float[Array, "4"]:
 
 
 def random_place(radius: PRNGKeyArray, angle: PRNGKeyArray, size: float) -> Float[Array, "2"]:
-    """Draw x and y (m) uniformly from a disc about the pad's centre.
-
-    Args:
-        radius: Random key for the distance from the centre.
-        angle: Random key for the direction.
-        size: Radius of the disc (m).
-    """
+    """Draw x and y (m) uniformly from a disc about the pad's centre with a radius `size` (m)."""
     r = size * jnp.sqrt(jax.random.uniform(radius))
     a = jax.random.uniform(angle, maxval=2 * jnp.pi)
     return jnp.stack([r * jnp.cos(a), r * jnp.sin(a)])

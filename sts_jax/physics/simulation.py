@@ -2,18 +2,20 @@
 
 import concurrent.futures
 import contextlib
+import functools
 import os
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 from tqdm import tqdm
 
 from sts_jax._checked import check_key
-from sts_jax.objects.body import Body
+from sts_jax.objects.body import Body, is_traced
 from sts_jax.physics.arguments import (
     check_arguments,
     check_condition,
@@ -22,25 +24,109 @@ from sts_jax.physics.arguments import (
     check_start,
     listed,
 )
-from sts_jax.physics.bodies import BodyError, hulls, shapes
-from sts_jax.physics.draws import draw
+from sts_jax.physics.bodies import BodyError, hulls, rigids, shapes
 from sts_jax.physics.engines import Engine, Rolled, Setup, gravity_at, in_c, in_mjx
-from sts_jax.physics.held import held_wrench
-from sts_jax.physics.mass_properties import rigids
+from sts_jax.physics.rest import held_wrench
 from sts_jax.physics.roll import SLOW_TIME, Record
-from sts_jax.physics.scenario import Hidden, Scenario, Start
-from sts_jax.physics.trajectory import Trajectory
+from sts_jax.physics.scenario import Hidden, Outcome, Scenario, Shape, Start
 from sts_jax.sensor import Sensor
 
 # m, thickness of the paper's gel. A trajectory in which the object goes deeper is drawn again. Contacts are found once
 # per step, so a corner that hits the pad at 3 m/s can be 3 mm deep before a contact pushes it (at steps of 1 ms).
 SUNK_LIMIT = 0.005
 ATTEMPTS = 5  # draws of one trajectory before an error is raised
+_FURTHER = 2**32 - 1  # `starts` folds it into the key. `simulate` folds in the indices of bodies, which are smaller
 WORKERS = 2  # chunks that MJX simulates at the same time, because XLA runs each chunk on one CPU core
 
 
+class Trajectory(NamedTuple):
+    """n trajectories with f frames each, sorted by body."""
+
+    time: Float[Array, "n f"]  # Time (s), 0 at frame 0.
+    pose: Float[Array, "n f 7"]  # Mesh frame in the sensor frame: position (m) and quaternion with w >= 0.
+    # Velocity of the mesh frame's origin (m/s) and angular velocity (rad/s), in the sensor frame.
+    velocity: Float[Array, "n f 6"]
+    # Force (N) and moment about the sensor's origin (N m) of the pad on the object. The wrench is the mean over the
+    # unbroken contact at the end of the interval before the frame, or 0 if the last time step has no contact. Frame 0
+    # of an object that a hand holds on the pad (`Start.carried`) has the wrench under the held pose.
+    wrench: Float[Array, "n f 6"]
+    contact: Bool[Array, "n f"]  # True if the pad pushes the object in the last time step before the frame.
+    wall: Bool[Array, "n f"]  # True if the stop wall pushes the object in the last time step before the frame.
+    gravity: Float[Array, "n f 3"]  # Gravity minus the acceleration of the pad, in the sensor frame (m/s^2).
+    # True if the object was slower than 5 mm/s and 0.1 rad/s for the last 0.2 s, or has left the pad.
+    settled: Bool[Array, "n"]
+    # Number of the outcome, from the poses of the first and the last frame. It is final where `settled` is True.
+    outcome: Int[Array, "n"]
+    touches: Int[Array, "n"]  # Number of contacts with pad or wall, separated by at least 5 ms.
+    sunk: Float[Array, "n"]  # Largest depth of the hull in pad or wall (m).
+    condition: Float[Array, "n c"]  # Condition of the start (`Scenario.quantities`), in SI units.
+    hidden: Hidden  # Hidden properties: arrays of shape (n,), and `up` of shape (n, 3).
+    body: Int[Array, "n"]  # Index of the body in the sequence of bodies.
+    resampled: Int[Array, "n"]  # Number of discarded draws, which were non-finite or in which the object sank too deep.
+
+    @property
+    def outcomes(self) -> tuple[Outcome, ...]:
+        """The outcome of each trajectory. For a scenario with outcomes of its own, use `Scenario.named`."""
+        return tuple(Outcome(int(number)) for number in np.ravel(self.outcome))
+
+    def __repr__(self) -> str:
+        shown = (self.time, self.outcome, self.settled, self.body)
+        if not all(isinstance(x, np.ndarray | np.generic | jax.Array) for x in shown) or is_traced(shown):
+            fields = (f"{name}={getattr(leaf, 'shape', leaf)}" for name, leaf in self._asdict().items())
+            return f"Trajectory({', '.join(fields)})"
+        number, time = np.size(self.outcome), np.asarray(self.time)
+        counts = Counter(_named(number) for number in np.ravel(self.outcome).tolist()).most_common()
+        moving = number - int(np.sum(self.settled))
+        return (
+            f"Trajectory({number} trajector{'y' if number == 1 else 'ies'} of {len(np.unique(self.body))} "
+            f"bod{'y' if len(np.unique(self.body)) == 1 else 'ies'}, {time.shape[-1] if time.ndim else 1} frames "
+            f"in {time.max(initial=0):.2f} s; {', '.join(f'{count} {name}' for name, count in counts)}; "
+            f"{moving} not settled at the end)"
+        )
+
+
+class Starts(NamedTuple):
+    """n random starts of one or more bodies, sorted by body."""
+
+    pose: Float[Array, "n 7"]  # Mesh frame in the sensor frame: position (m) and quaternion with w >= 0.
+    hidden: Hidden  # Hidden properties of each start: arrays of shape (n,), and `up` of shape (n, 3).
+    body: Int[Array, "n"]  # Index of the body in the sequence of bodies.
+
+
+@functools.partial(jax.jit, static_argnames=("scenario", "pad"))
+def draw(
+    key: PRNGKeyArray,
+    body: Int[Array | np.ndarray, "n"],
+    nth: Int[Array | np.ndarray, "n"],
+    attempt: Int[Array | np.ndarray, "n"],
+    shapes: Shape,
+    scenario: Scenario,
+    pad: tuple[float, float],
+) -> tuple[Start, Hidden]:
+    """Draw a start and the hidden properties of each of n trajectories. A draw does not depend on the other draws.
+
+    In `Inclined`, a draw can change if the arrays in `shapes` are padded to another number of faces.
+
+    Args:
+        key: Key of all draws.
+        body: Index of the body of each draw.
+        nth: Number of each draw among those of the same body, from 0.
+        attempt: Number of earlier draws of the trajectory that failed.
+        shapes: Geometry of all bodies, with a leading axis of bodies.
+        scenario: The scenario that draws.
+        pad: Size of the pad along x and y (m).
+    """
+
+    def one(body: ArrayLike, nth: ArrayLike, attempt: ArrayLike) -> tuple[Start, Hidden]:
+        draw_key = jax.random.fold_in(jax.random.fold_in(jax.random.fold_in(key, body), nth), attempt)
+        start, hidden = jax.random.split(draw_key)
+        return scenario.start(start, jax.tree.map(lambda x: x[body], shapes), pad), scenario.hidden(hidden)
+
+    return jax.vmap(one)(body, nth, attempt)
+
+
 class _Given(NamedTuple):
-    """The starts and hidden properties that replace the random ones, or None."""
+    """What replaces the random draws, or None."""
 
     starts: Start | None
     hidden: Hidden | None
@@ -71,8 +157,8 @@ def simulate(
     """Simulate `num` trajectories of each body with random starts and hidden properties.
 
     Trajectory j of body i depends on `key`, i, j and the body, not on the number of other trajectories. A trajectory
-    fails if it has non-finite values or the object sinks more than 5 mm into the pad or the stop wall. It is then drawn
-    again with another key. `Trajectory.resampled` counts the failures.
+    that has non-finite values, or whose object sinks more than 5 mm into the pad or the stop wall, is drawn again with
+    another key (`Trajectory.resampled`).
 
     Args:
         key: Key of the whole set, from `jax.random.key`.
@@ -80,34 +166,21 @@ def simulate(
         sensor: Sensor whose `gel.size` is the size of the pad.
         scenario: `Freefall()`, `Inclined()`, `Perturbed()`, `Released()` or another `Scenario`.
         num: Number of trajectories of each body.
-        start: Starts that replace the random ones, ordered body by body. If all bodies together have n trajectories,
-            `pose` has the shape (n, 7) and `condition` (the c numbers of the scenario's known quantities, such as an
-            acceleration of the pad) has the shape (n, c). `held` (number of time steps before the release) and
-            `carried` (share of the weight that the pad carries before the release) have the shape (n,) or are one
-            number for all trajectories. The simulation begins one frame interval (`scenario.steps` time steps)
-            before frame 0, so `held=scenario.steps` releases an object at frame 0.
-        hidden: Hidden properties (friction, mass of the shell, and contents) that replace the random ones, ordered body
-            by body. If all bodies together have n trajectories, the field `up` has the shape (n, 3), and the other
-            fields have the shape (n,). A trajectory has the same start with and without `hidden` if it has the same
-            number of failures (`Trajectory.resampled`) in both cases.
-        progress: True shows a progress bar on standard error. If `progress` is a function, it is called after each
-            chunk with the number of trajectories done so far. With MJX, tens of seconds of compilation precede the
-            first chunk.
+        start: Starts of all n trajectories that replace the random ones. `held` and `carried` may be one number for
+            all. The simulation begins one frame interval before frame 0, so `held=scenario.steps` releases an object at
+            frame 0.
+        hidden: Hidden properties of all n trajectories that replace the random ones. A trajectory has the same start
+            with and without `hidden` if it fails equally often.
+        progress: True shows a progress bar on standard error. A function is called after each chunk with the number of
+            finished trajectories. With MJX, tens of seconds of compilation precede the first chunk.
         chunk: Largest number of trajectories that are simulated at once. With MJX, each new value causes a compilation
-            and changes the results by rounding errors. Larger values suit a GPU. With C MuJoCo, each thread receives
-            at most `chunk` trajectories at a time, and the results do not depend on `chunk`.
-        engine: "mujoco" is C MuJoCo on all CPU cores. "mjx" compiles the simulation for JAX's default device. On a CPU,
-            MJX is several times as slow as C MuJoCo. On a GPU, MJX is faster only with a large `chunk`, such as 4,096
-            trajectories of one object. Both engines draw the same starts and hidden properties from a key.
-
-    Returns:
-        `num` trajectories of body 0, then `num` trajectories of body 1, and so on.
+            and changes the results by rounding errors. Larger values suit a GPU.
+        engine: "mujoco" is C MuJoCo on all CPU cores. "mjx" runs on JAX's default device: several times as slow on a
+            CPU, and faster on a GPU only with a large `chunk`, such as 4,096 trajectories of one object. Both engines
+            draw the same starts and hidden properties from a key.
 
     Raises:
         BodyError: A body cannot start in the scenario, has bad values, or has a trajectory that fails five times.
-            BodyError is a ValueError.
-        ValueError: Another argument is out of range. The message names the argument.
-        TypeError: An argument has the wrong type.
     """
     bodies = listed(body)
     check_key(key)
@@ -139,9 +212,7 @@ def _reported(progress: Any, count: int, engine: Engine) -> Iterator[Callable[[i
         yield progress
         return
     if not isinstance(progress, bool):
-        raise TypeError(
-            f"progress is {progress!r}, but it must be True, False or a function of the number of trajectories done"
-        )
+        raise TypeError(f"progress is {progress!r}, but it must be True, False or a function of a number")
     first = "simulate: compiling" if engine == "mjx" else "simulate"
     with tqdm(total=count, desc=first, unit=" trajectories", disable=not progress) as bar:
 
@@ -160,19 +231,7 @@ def _accepted(
     engine: Engine,
     report: Callable[[int], object],
 ) -> _Accepted:
-    """Draw and simulate all trajectories. Draw failed ones again until none fails.
-
-    Args:
-        key: Key of the whole set.
-        setup: Properties of the trajectories that do not depend on the draws.
-        given: Starts and hidden properties that replace the random ones.
-        chunk: Largest number of trajectories in one call of the engine.
-        engine: Engine that simulates.
-        report: Function that is called with the number of trajectories done so far.
-
-    Raises:
-        BodyError: A body cannot start in the scenario, or a trajectory fails in every attempt.
-    """
+    """Draw and simulate all trajectories, and draw failed ones again until none fails."""
     count, scenario = len(setup.which), setup.scenario
     nth = np.arange(count) % (count // len(setup.bodies))
     prepare, workers = (in_mjx, WORKERS) if engine == "mjx" else (in_c, os.cpu_count() or 1)
@@ -198,9 +257,8 @@ def _accepted(
             worst = int(attempt.argmax())
             raise BodyError(
                 int(setup.which[worst]),
-                f"trajectory {nth[worst]} of this body failed in each of {ATTEMPTS} attempts, because it has "
-                f"non-finite values or the object sinks more than {SUNK_LIMIT} m into the pad or the stop wall: check "
-                "the thickness of the body's hull and the body's mass",
+                f"trajectory {nth[worst]} of this body failed in each of {ATTEMPTS} attempts (non-finite values, or "
+                f"deeper than {SUNK_LIMIT} m in the pad or the stop wall): check the body's hull and mass",
             )
     rolled = jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *(rows[i] for i in range(count)))
     return _Accepted(starts, hidden, rolled, attempt)
@@ -216,14 +274,7 @@ def _chunks(setup: Setup, pending: np.ndarray, chunk: int, engine: Engine, worke
 
 
 def _with_held(setup: Setup, sensor: Sensor, accepted: _Accepted, down: Float[np.ndarray, "n"]) -> Record:
-    """Return the records, with the wrench of the pad on objects that a hand holds on the pad in frame 0.
-
-    Args:
-        setup: Properties of the trajectories that do not depend on the draws.
-        sensor: Sensor whose gel determines the centre of pressure.
-        accepted: Accepted draws and their results.
-        down: Gravity towards the pad in frame 0 (m/s^2).
-    """
+    """The records, with the wrench on objects that a hand holds in frame 0, under gravity `down` (m/s^2)."""
     record, starts = accepted.rolled.record, jax.tree.map(np.asarray, accepted.starts)
     held = np.flatnonzero((starts.carried > 0) & (starts.held >= setup.scenario.steps))
     if not len(held):
@@ -262,3 +313,26 @@ def _trajectory(setup: Setup, sensor: Sensor, accepted: _Accepted) -> Trajectory
         body=jnp.asarray(setup.which, jnp.int32),
         resampled=jnp.asarray(accepted.attempt),
     )
+
+
+def starts(
+    key: PRNGKeyArray, bodies: Body | Sequence[Body], sensor: Sensor, scenario: Scenario, num: int = 1
+) -> Starts:
+    """Draw `num` random starts of each body as `simulate` does, and simulate nothing.
+
+    The starts are independent of those that `simulate` draws from the same key. Start j of body i depends on `key`, i,
+    j and the body, and in `Inclined` it can depend on the other bodies.
+    """
+    several = listed(bodies)
+    check_key(key)
+    check_arguments(several, sensor, scenario, num=num)
+    pad = (float(sensor.gel.size[0]), float(sensor.gel.size[1]))
+    which, nth = np.repeat(np.arange(len(several)), num), np.tile(np.arange(num), len(several))
+    further, first = jax.random.fold_in(key, _FURTHER), np.zeros(len(which), np.int32)
+    start, hidden = draw(further, which, nth, first, shapes(several, scenario), scenario=scenario, pad=pad)
+    return Starts(start.pose, hidden, jnp.asarray(which, jnp.int32))
+
+
+def _named(number: int) -> str:
+    """Return an outcome in words, or as "outcome N" if `Outcome` has no member with this number."""
+    return str(Outcome(number)) if number in set(Outcome) else f"outcome {number}"

@@ -1,0 +1,143 @@
+"""What `simulate` and `place` refuse, with a message that names the argument or the field."""
+
+import dataclasses
+import inspect
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sts_jax import objects, physics
+from sts_jax.physics import Freefall, Inclined, Perturbed, Released
+from sts_jax.sensor import Sensor
+
+NAN = float("nan")
+BODIES = [objects.make(jax.random.key(i), name) for i, name in enumerate(["bottle", "fork"])]
+GOOD = {"key": jax.random.key(0), "body": BODIES[0], "sensor": Sensor(), "scenario": Freefall(), "num": 2}
+START = physics.Start(np.tile(np.float32([0, 0, 0.1, 1, 0, 0, 0]), (2, 1)), np.array(0), np.zeros((2, 0), np.float32))
+HIDDEN = physics.Hidden(np.ones(2), np.ones(2), np.ones(2), np.tile(np.float32([0, 0, 1]), (2, 1)))
+LEANING = jnp.asarray(BODIES[0].hulls) + BODIES[0].hulls[..., 2:] * jnp.array([1.5, 0, 0])
+
+
+def changed(scenario: physics.Scenario, **fields: object) -> dict:
+    scenario = dataclasses.replace(scenario)
+    for name, value in fields.items():
+        object.__setattr__(scenario, name, value)  # past the tests' own checks of types
+    return {"scenario": scenario}
+
+
+def second(**fields: object) -> dict:
+    return {"body": [BODIES[0], dataclasses.replace(BODIES[1], **fields)]}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"body": "bottle.obj"}, r"body 0 is 'bottle\.obj', but it must be a Body, .*objects\.load"),
+        ({"body": []}, "no body"),
+        ({"sensor": None}, "sensor is None, but it must be a Sensor"),
+        ({"scenario": "freefall"}, r"scenario is 'freefall', but it must be Freefall\(\)"),
+        ({"scenario": Freefall}, r"scenario is <class .*Freefall'>, but it must be Freefall\(\)"),
+        ({"key": 0}, r"key is 0, but it must be a JAX key, such as jax\.random\.key\(0\)"),
+        ({"num": 1.5}, "num is 1.5, but it must be a whole number"),
+        ({"num": 0}, "num is 0"),
+        ({"chunk": 0}, "chunk is 0, but it must be a whole number"),
+        ({"progress": "bar"}, "progress is 'bar', but it must be True, False or a function"),
+        ({"engine": "bullet"}, "engine is 'bullet', but it must be 'mjx' or 'mujoco'"),
+        (second(shell_mass=jnp.float32(-0.1)), "body 1: shell_mass is -0.1"),
+        (second(shell_mass=jnp.float32(NAN)), "body 1: shell_mass is nan"),
+        (second(hulls=jnp.full((1, 64, 3), NAN)), "body 1: the field `hulls` has a vertex that is not finite"),
+        (second(hulls=jnp.zeros((1, 64, 3))), "body 1: the collision hull spans no volume"),
+        (second(hulls=jnp.zeros((3, 64, 3))), "body 1: hulls has shape"),
+        (second(vertices=jnp.full((1024, 3), NAN)), r"body 1: vertices has values that are not finite \(3,072 of"),
+        (second(category=jnp.int32(99)), "body 1: category is 99, but it must be -1"),
+        (second(shell_inertia=-jnp.eye(3), contents_density=jnp.float32(0)), "body 1: principal moments"),
+        ({**second(hulls=LEANING), "scenario": Perturbed()}, "body 1: it does not stand upright"),
+        (changed(Freefall(), frames=59.5), r"scenario\.frames is 59.5, .* a whole number"),
+        (changed(Freefall(), frames=True), r"scenario\.frames is True, .* a whole number"),
+        (changed(Freefall(), height="0.05"), r"scenario\.height is '0.05', .* a number"),
+        (changed(Freefall(), fill=[0.0, 1.0]), r"scenario\.fill is .* a tuple of two numbers"),
+        (changed(Freefall(), fill=(0.0, "1")), r"scenario\.fill is .* a tuple of two numbers"),
+        (changed(Freefall(), contact=0.001), r"scenario\.contact is .* a physics\.Contact"),
+        (changed(Freefall(), friction=(-0.1, 0.5)), r"scenario\.friction is .* 0 < low"),
+        (changed(Freefall(), shell_scale=(1.1, 0.9)), r"scenario\.shell_scale"),
+        (changed(Freefall(), fill=(0.0, 1.5)), r"scenario\.fill"),
+        (changed(Freefall(), height=NAN), r"scenario\.height"),
+        (changed(Freefall(), tilt=-0.1), r"scenario\.tilt is -0.1 rad"),
+        (changed(Freefall(), rate=30.0), "rate is 30"),
+        (changed(Freefall(), frames=0), r"scenario\.frames is 0, but it must be >= 1"),
+        (changed(Freefall(), frames=10), r"scenario\.frames is 10 .* 0.05 m .* 0.301 s: give at least 11 frames"),
+        (changed(Freefall(), height=1000.0), r"scenario\.frames is 60 \(1.89 s\), .* 1000 m .* 14.5 s"),
+        (changed(Inclined(), slope=30.0), r"scenario\.slope is 30.0 rad, .* use math\.radians"),
+        (changed(Inclined(), wall=-0.1), r"scenario\.wall"),
+        (changed(Inclined(), resting=1.5), r"scenario\.resting"),
+        (changed(Inclined(), along=(0.1, -0.1)), r"scenario\.along"),
+        (changed(Inclined(), tries=0), r"scenario\.tries"),
+        (changed(Perturbed(), acceleration=(-1.0, 2.0)), r"scenario\.acceleration"),
+        (changed(Perturbed(), duration=(0.2, 0.1)), r"scenario\.duration"),
+        (changed(Perturbed(), spread=-0.1), r"scenario\.spread"),
+        (changed(Released(), beyond=(-10.0, 10.0)), r"scenario\.beyond .* use math\.radians"),
+        (changed(Released(), beyond=(NAN, 0.1)), r"scenario\.beyond"),
+        (changed(Released(), skew=5.0), r"scenario\.skew"),
+        (changed(Released(), carried=(0.5, 1.5)), r"scenario\.carried"),
+        ({"start": START._replace(pose=np.zeros((3, 7)))}, r"start\.pose has shape \(3, 7\), but it must be \(2, 7\)"),
+        ({"start": START._replace(pose=np.zeros((2, 7)))}, r"start\.pose has quaternions whose length is not 1"),
+        ({"start": START._replace(pose=np.full((2, 7), NAN))}, r"start\.pose has values that are not finite"),
+        ({"start": START._replace(condition=np.zeros((2, 1)))}, r"start\.condition has shape \(2, 1\), .* \(2, 0\)"),
+        ({"start": START._replace(held=np.array(-1))}, r"start\.held is -1, but each value must be an integer >= 0"),
+        ({"start": START._replace(held=np.zeros(3, int))}, r"start\.held has shape \(3,\)"),
+        ({"start": START._replace(carried=np.array(1.5))}, r"start\.carried is from 1\.5 to 1\.5"),
+        ({"hidden": HIDDEN, "num": 3}, r"hidden\.fill has shape \(2,\)"),
+        ({"hidden": HIDDEN._replace(friction=-np.ones(2))}, r"hidden\.friction has the value -1.0, but it must be > 0"),
+        ({"hidden": HIDDEN._replace(up=np.ones((2, 3)))}, r"hidden\.up has rows that are not unit vectors"),
+        ({"hidden": HIDDEN._replace(up=np.eye(2))}, r"hidden\.up has shape \(2, 2\)"),
+        ({"hidden": HIDDEN._replace(fill=np.array([0, 1.5]))}, r"hidden\.fill is from 0.0 to 1.5"),
+    ],
+)
+def test_what_simulate_refuses_is_named(change, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        inspect.unwrap(physics.simulate)(**GOOD | change)
+
+
+def test_the_fewest_frames_that_are_allowed_let_an_object_settle():
+    Freefall(frames=11).check()
+
+
+TURN = np.float32([[1, 0, 0], [0, np.cos(0.5), -np.sin(0.5)], [0, np.sin(0.5), np.cos(0.5)]])
+BODY = BODIES[0]
+OUTSIDE = dataclasses.replace(BODY, shell_com=jnp.array([0.3, 0.2, 0.3]), contents_density=jnp.float32(0))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"face": 99}, r"`face` is 99, .* no such face: the body can rest on faces 0 \(the most likely\) to \d+"),
+        ({"face": -1}, r"`face` is -1, but the body has no such face"),
+        ({"face": "sideways"}, r"`face` is 'sideways', but it must be the index of a face or 'upright'"),
+        ({"position": (0.2, 0.0)}, r"position is \(0.2, 0.0\) m, but the body would fall off"),
+        ({"position": (0.0, NAN)}, "position is .* 2 finite numbers"),
+        ({"yaw": float("inf")}, "yaw is inf, but it must be one finite number"),
+        ({"fill": 1.5}, "fill is 1.5, .* from 0 to 1"),
+        ({"shell_scale": 0.0}, "shell_scale is 0.0, but it must be > 0"),
+        ({"up": (0.0, 0.0, 2.0)}, r"`up` is .* of length 2, but it must have the length 1"),
+        ({"body": dataclasses.replace(BODY, hulls=BODY.hulls @ TURN.T), "face": "upright"}, "does not stand stably"),
+        ({"body": OUTSIDE}, "the body cannot rest on any of its faces"),
+        ({"body": dataclasses.replace(BODY, hulls=jnp.zeros((1, 64, 3)))}, "hulls span no volume"),
+        (
+            {"body": dataclasses.replace(BODY, vertices=BODY.vertices.at[3, 1].set(NAN))},
+            r"vertices has values that are not finite \(1 of",
+        ),
+        ({"body": "mug.obj"}, r"body is 'mug\.obj', but it must be one Body, from .* objects\.load"),
+        ({"body": Sensor()}, r"body is Sensor\(.*, but it must be one Body"),
+        ({"sensor": None}, "sensor is None, but it must be a Sensor"),
+    ],
+)
+def test_what_place_refuses_is_named(changes, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        inspect.unwrap(physics.place)(**{"body": BODY, "sensor": Sensor()} | changes)
+
+
+def test_stable_faces_are_not_computed_of_a_traced_body():
+    with pytest.raises(TypeError, match=r"`body`, .* is traced.* outside jit"):
+        jax.eval_shape(lambda body: inspect.unwrap(physics.stable_faces)(body), BODY)

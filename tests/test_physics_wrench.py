@@ -1,0 +1,153 @@
+"""`physics.wrench` against Newton's laws, MuJoCo's generalised forces and MuJoCo's own sensors."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sts_jax import physics
+from sts_jax.physics.scene import mjx
+
+KINDS = [("pyramidal", 1), ("pyramidal", 3), ("pyramidal", 4), ("pyramidal", 6)]
+KINDS += [("elliptic", 3), ("elliptic", 4), ("elliptic", 6)]
+MASS, G = 0.3, 9.81
+
+
+def model_of(cone: str, condim: int) -> mujoco.MjModel:
+    """A tilted plane, a box on it whose centre of mass is off its middle, and a ball that touches both of them."""
+    return mujoco.MjModel.from_xml_string(f"""
+    <mujoco>
+      <option cone="{cone}" timestep="0.001" impratio="10"/>
+      <default><geom condim="{condim}" friction="0.8 0.02 0.005" solref="0.01 1"/></default>
+      <worldbody>
+        <geom name="plane" type="plane" size="1 1 .1"/>
+        <body name="box" pos="0 0 .02">
+          <freejoint/>
+          <inertial pos=".01 -.005 0" mass="{MASS}" diaginertia="1e-4 1e-4 1e-4"/>
+          <geom name="box" type="box" size=".03 .03 .02"/>
+          <site name="tilted" pos=".01 .02 .03" euler="30 -40 70"/>
+        </body>
+        <body name="ball" pos=".2 0 .03">
+          <freejoint/>
+          <geom name="ball" type="sphere" size=".03" mass=".1"/>
+        </body>
+      </worldbody>
+    </mujoco>""")
+
+
+def moving(cone: str, condim: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """Both bodies slide, roll and spin on the plane, and the ball pushes the side of the box."""
+    model = model_of(cone, condim)
+    data = mujoco.MjData(model)
+    data.qpos[:3], data.qpos[7:10] = [0.1, -0.05, 0.0199], [0.1599, -0.04, 0.0299]
+    data.qvel[:] = [0.3, -0.2, -0.05, 0.4, -0.3, 2.0, -0.4, 0.3, -0.05, 3.0, 5.0, -4.0]
+    mujoco.mj_forward(model, data)
+    assert data.ncon >= 6
+    return model, data
+
+
+@pytest.mark.parametrize(("cone", "condim"), KINDS)
+def test_all_contacts_of_a_free_body_are_its_constraint_force(cone, condim):
+    model, data = moving(cone, condim)
+    inputs = mjx.put_model(model), mjx.put_data(model, data)
+    in_mjx = jax.jit(mjx.forward)(*inputs)
+    for own, others, at in (("box", ["plane", "ball"], 0), ("ball", ["plane", 1], 6)):
+        pose = data.qpos[at // 6 * 7 :][:7]
+        turn = Rotation.from_quat(pose[3:], scalar_first=True)
+        for d, m, tolerance in ((data, model, 1e-10), (in_mjx, inputs[0], 1e-5)):
+            force = np.asarray(d.qfrc_constraint)[at : at + 6]
+            expected = np.concatenate([force[:3], turn.apply(force[3:])])  # the free joint's moments are in its frame
+            size = np.abs(expected).max()
+            assert size > 0.1
+            frame = np.array([*pose[:3], 1, 0, 0, 0])
+            np.testing.assert_allclose(physics.wrench(m, d, others, frame), expected, atol=tolerance * size)
+            np.testing.assert_allclose(physics.wrench(m, d, own, frame), -expected, atol=tolerance * size)
+
+
+@pytest.mark.parametrize(("cone", "condim"), KINDS)
+def test_mjx_gives_the_wrench_of_c_mujoco(cone, condim):
+    model, data = moving(cone, condim)
+    m = mjx.put_model(model)
+    d = jax.jit(mjx.forward)(m, mjx.put_data(model, data))
+    for own in ("plane", "ball"):
+        truth = physics.wrench(model, data, own)
+        both = jax.jit(jax.vmap(lambda d, own=own: physics.wrench(m, d, own)))(jax.tree.map(lambda x: x[None], d))
+        np.testing.assert_allclose(both[0], truth, atol=2e-3 * np.abs(truth).max())
+
+
+@pytest.mark.parametrize(("cone", "condim"), [("elliptic", 1), *KINDS])
+@pytest.mark.parametrize("push", [np.zeros(6), np.array([0.5, -0.3, -2.0, 0.01, 0.02, 0.004])])
+def test_a_pressed_box_is_in_balance(cone, condim, push):
+    model = model_of(cone, condim)
+    data = mujoco.MjData(model)
+    if condim == 1:
+        push = push * [0, 0, 1, 1, 1, 0]  # without friction, the plane carries neither sliding nor spin
+    elif condim == 3:
+        push = push * [1, 1, 1, 1, 1, 0.5]
+    data.body("box").xfrc_applied[:] = push  # at the centre of mass
+    mujoco.mj_step(model, data, 3000)
+    mujoco.mj_forward(model, data)
+    com = data.body("box").xipos
+    load = push[:3] - [0, 0, MASS * G]
+    expected = -np.concatenate([load, push[3:] + np.cross(com, load)])
+    np.testing.assert_allclose(physics.wrench(model, data, "plane"), expected + _ball(model, data), atol=2e-4)
+    if not push.any():  # the force acts under the centre of mass
+        centre = np.array([-expected[4], expected[3]]) / (MASS * G)
+        np.testing.assert_allclose(centre, com[:2], atol=1e-9)
+
+
+def _ball(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    """The weight of the ball, which rests on the same plane."""
+    weight = np.array([0, 0, 0.1 * G])
+    return np.concatenate([weight, np.cross(data.body("ball").xipos, weight)])
+
+
+def test_contacts_among_the_geoms_do_not_count_and_actions_equal_reactions():
+    model, data = moving("elliptic", 6)
+    pair = physics.wrench(model, data, ["box", "ball"])
+    np.testing.assert_allclose(pair, -physics.wrench(model, data, "plane"), atol=1e-12)
+    alone = physics.wrench(model, data, "box") + physics.wrench(model, data, "ball")
+    np.testing.assert_allclose(pair, alone, atol=1e-12)
+    np.testing.assert_array_equal(physics.wrench(model, data, [0, 1, 2]), 0)
+
+
+def test_a_site_and_its_pose_are_the_same_frame_and_move_the_moment():
+    model, data = moving("elliptic", 4)
+    site = data.site("tilted")
+    turn = Rotation.from_matrix(site.xmat.reshape(3, 3))
+    pose = np.concatenate([site.xpos, turn.as_quat(scalar_first=True)])
+    force, moment = np.split(physics.wrench(model, data, "plane"), 2)
+    expected = np.concatenate([turn.inv().apply(force), turn.inv().apply(moment - np.cross(site.xpos, force))])
+    np.testing.assert_allclose(physics.wrench(model, data, "plane", pose), expected, atol=1e-12)
+    np.testing.assert_allclose(physics.wrench(model, data, "plane", "tilted"), expected, atol=1e-12)
+    m, d = mjx.put_model(model), mjx.put_data(model, data)
+    size = np.abs(expected).max()
+    for frame in ("tilted", jnp.asarray(pose, jnp.float32)):
+        np.testing.assert_allclose(physics.wrench(m, d, "plane", frame), expected, atol=1e-5 * size)
+
+
+def test_the_moment_has_a_gradient_in_the_frame():
+    model, data = moving("elliptic", 3)
+    m, d = mjx.put_model(model), mjx.put_data(model, data)
+    force = physics.wrench(m, d, "plane")[:3]
+    frame = jnp.array([0.01, 0.02, 0.03, 1, 0, 0, 0])
+    slope = jax.jacobian(lambda pose: physics.wrench(m, d, "plane", pose))(frame)[3:, :3]
+    np.testing.assert_allclose(slope @ jnp.array([1.0, 2, 3]), -jnp.cross(jnp.array([1.0, 2, 3]), force), rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("geoms", "frame", "message"),
+    [
+        ("table", None, "the model has no geom 'table'"),
+        ([0, 7], None, "geoms contains 7, but the model has geoms 0 to 2"),
+        (-1, None, "geoms contains -1"),
+        ("box", "wrist", "the model has no site 'wrist'"),
+        ("box", np.array([0, 0, 0, 2.0, 0, 0, 0]), "frame has a quaternion of length 2, but it must be 1"),
+    ],
+)
+def test_what_does_not_exist_is_named(geoms, frame, message):
+    model, data = moving("elliptic", 3)
+    with pytest.raises(ValueError, match=message):
+        physics.wrench(model, data, geoms, frame)
