@@ -109,16 +109,6 @@ def test_outcomes_of_the_scenario_have_names_and_are_counted(page):
         _ = rolled._replace(outcome=np.int32([100])).outcomes
 
 
-def test_a_bottle_that_is_pushed_hard_goes_farther(page):
-    bottle, scenario = page["bottle"], page["Rolled"]
-    moved = []
-    for speed in (0.05, 0.25):
-        found = physics.simulate(jax.random.key(2), bottle, sts.Sensor(), scenario(speed=(speed, speed)), 4)
-        ahead = found.condition / speed
-        moved.append(np.sum((found.pose[:, -1, :2] - found.pose[:, 0, :2]) * ahead, axis=1))
-    assert np.all(moved[1] > moved[0])
-
-
 TAKEN = enum.IntEnum("Taken", {"STOPS": 0})
 
 

@@ -65,16 +65,6 @@ def test_the_gel_balances_every_class_and_the_default_leds_neither_clip_nor_hide
         assert np.abs(image - empty).max() > 0.05
 
 
-def test_the_wrench_is_the_weight_with_its_moment_about_the_origin(bodies):
-    body = bodies[0]
-    pose, wrench = physics.place(body, sts.Sensor(), **PLACES)
-    mass, com, _ = (np.asarray(x, np.float64) for x in objects.rigid(body, PLACES["fill"], 1.0))
-    w, x, y, z = np.asarray(pose[3:], np.float64)
-    centre = Rotation.from_quat([x, y, z, w]).apply(com) + np.asarray(pose[:3])
-    force = np.array([0, 0, 9.81 * mass])
-    np.testing.assert_allclose(wrench, np.concatenate([force, np.cross(centre, force)]), rtol=1e-4, atol=1e-7)
-
-
 def test_placement_has_the_requested_face_yaw_and_position(bodies):
     body = bodies[0]
     standing = physics.place(body, sts.Sensor(), face="upright", position=(0.01, -0.02), yaw=np.pi / 2)
@@ -88,13 +78,3 @@ def test_placement_has_the_requested_face_yaw_and_position(bodies):
     faces = physics.stable_faces(body)
     assert np.all(np.diff(faces.share) <= 0)
     np.testing.assert_allclose(faces.share.sum(), 1, rtol=1e-6)
-
-
-def test_more_shell_or_contents_weigh_more(bodies):
-    body = bodies[0]
-    light, full, heavy = (
-        float(physics.place(body, sts.Sensor(), face="upright", **changes).wrench[2])
-        for changes in ({"fill": 0.0}, {"fill": 1.0}, {"fill": 0.0, "shell_scale": 2.0})
-    )
-    np.testing.assert_allclose(heavy, 2 * light, rtol=1e-5)
-    assert full > light + 9.81 * 0.05

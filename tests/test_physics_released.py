@@ -4,7 +4,6 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
@@ -12,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import sts_jax as sts
 from sts_jax import objects, physics
-from sts_jax.physics import rest, scene
+from sts_jax.physics import rest
 from sts_jax.physics.scenario import STANDING, G
 
 PAD = (0.15, 0.15)
@@ -210,17 +209,6 @@ def test_the_energy_never_rises(bodies, let_go, rigids):
             spin = turn.apply(velocity[3:], inverse=True)
             energy.append(mass * (speed @ speed / 2 + G * (pose[2] + centre[2])) + spin @ inertia @ spin / 2)
         assert max(energy) < energy[0] + 0.02 * mass * G * 0.03  # 2 % of a fall of 30 mm
-
-
-def test_objects_fall_as_in_c_mujoco(bodies, let_go, rigids):
-    # A plain loop of MuJoCo, which finds the contacts of the mesh itself, until rounding decides.
-    for row in range(0, len(let_go.pose), 6):
-        model = scene.compile_scene(np.asarray(bodies[let_go.body[row]].hulls), PAD, SCENARIO.contact)
-        data = mujoco.MjData(model)
-        scene.set_rigid(model, data, *(part[row] for part in rigids))
-        data.qpos[:] = let_go.pose[row, 0]
-        mujoco.mj_step(model, data, nstep=3 * SCENARIO.steps)
-        np.testing.assert_allclose(let_go.pose[row, 3, :3], data.qpos[:3], atol=1e-3)
 
 
 @pytest.mark.slow
