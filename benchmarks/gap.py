@@ -105,7 +105,6 @@ def recording(folder: Path, note: str) -> Iterator[hardware.Session]:
     origin = hardware.Origin(note, "TWIN", SIZE[1], SIZE[0], ON)
     with hardware.Session(folder, origin) as session:
         yield session
-        session.flush()
 
 
 def record(device: twin.Twin, folder: Path, count: int, note: str, bar: Bar) -> list[tuple[float, ...]]:
@@ -129,7 +128,6 @@ def record(device: twin.Twin, folder: Path, count: int, note: str, bar: Bar) -> 
                 session.save(number, end, pair)
                 poses.append(pose)
             session.confirm(number, note)
-            session.flush()
         bar(note, count, count)
     return poses
 

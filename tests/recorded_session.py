@@ -62,5 +62,4 @@ def record(workdir, count, *, leds="0123", sensor_file=True, seed=0):
                 images = (raw(drawn(place, colour, random)) for colour in ((60, 60, 60), (220, 90, 40)))
                 session.save(number, end, pair(*images))
             session.confirm(number)
-            session.flush()
     return places

@@ -37,8 +37,6 @@ def write(folder):
             for end in ("initial", "final"):
                 session.save(number, end, pair(number, end))
             session.confirm(number, note=f"note {number}")
-            while session.waiting:
-                time.sleep(0.0005)
             assert session.confirmed == before + 1
             print(number, flush=True)
 

@@ -24,7 +24,6 @@ def write(folder, numbers, shift=0):
                 made = pair(number + shift, end, SIZE)
                 session.save(number, end, made)
             session.confirm(number)
-            session.flush()
     return folder
 
 

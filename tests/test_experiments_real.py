@@ -141,7 +141,7 @@ def view(stage=Stage.REVIEW, number=0, **changes):
     taken = pair(0, "initial")
     values = {
         **{"pair": taken, "stage": stage, "instruction": "Do.", "contact": True, "still": True, "number": number},
-        **{"confirmed": 4, "waiting": 1, "problem": None, "initial": taken, "final": None},
+        **{"confirmed": 4, "problem": None, "initial": taken, "final": None},
     }
     return hardware.View(**{**values, **changes})
 
@@ -160,7 +160,7 @@ def test_the_page_shows_a_view(page):
     page.show(view())
     facts = json.loads(ask(page, "GET", "/view")[1])
     assert facts["age_s"] >= 0
-    expected = {"stage": "review", "number": 0, "confirmed": 4, "waiting": 1, "count": 5, "ends": ["initial"]}
+    expected = {"stage": "review", "number": 0, "confirmed": 4, "count": 5, "ends": ["initial"]}
     assert {name: facts[name] for name in expected} == expected
     assert ask(page, "GET", "/end/initial/tactile.jpg")[1].startswith(b"\xff\xd8")
     for path in ("/end/final/tactile.jpg", "/end/initial/pair.json", "/end/__class__/visual.jpg", "/../real.py"):
@@ -247,7 +247,6 @@ def workdir(tmp_path):
                 session.save(number, end, pair(number, end))
             if number < 2:
                 session.confirm(number, f"note {number}")
-            session.flush()
     return tmp_path
 
 

@@ -1,7 +1,6 @@
 """Collecting from a sensor's devices without a sensor. A player places and releases an object as the guide asks for."""
 
 import errno
-import threading
 
 import numpy as np
 import pytest
@@ -85,21 +84,6 @@ def test_trajectories_are_collected_discarded_and_continued(peer, sensor, tmp_pa
         check(trajectory, trajectory.number)
 
 
-def test_collecting_goes_on_while_the_disk_is_slow(peer, sensor, tmp_path, monkeypatch):
-    write, reviewing = storage.write_folder, threading.Event()
-
-    def slow(path, *content):
-        assert reviewing.wait(60)
-        write(path, *content)
-
-    monkeypatch.setattr(storage, "write_folder", slow)
-    person = Playing(Player(peer))
-    person.stop_after = lambda view: view.stage is Stage.REVIEW and reviewing.set()
-    assert collect(sensor, tmp_path / "session", person, 1) == 1
-    assert max(view.waiting for view in person.views if view.stage is Stage.REVIEW) >= 1
-    check(hardware.load_recordings(tmp_path / "session")[0], 0)
-
-
 def test_stopping_in_the_middle_keeps_the_initial_pair(peer, sensor, tmp_path):
     person = Playing(Player(peer), stop_after=lambda view: view.stage is Stage.STILL)
     assert collect(sensor, tmp_path / "session", person, None) == 0
@@ -120,31 +104,26 @@ def test_an_interruption_by_the_keyboard_keeps_what_was_confirmed(peer, sensor, 
     check(trajectory, 0)
 
 
-def test_a_full_disk_is_shown_before_the_next_trajectory(peer, sensor, tmp_path, monkeypatch):
-    write, full = storage.write_folder, threading.Event()
+@pytest.mark.parametrize("fails", ["write_folder", "write_manifest"])
+def test_a_full_disk_is_shown_and_loses_nothing(peer, sensor, tmp_path, monkeypatch, fails):
+    person, problems, write = Playing(Player(peer)), [], getattr(storage, fails)
 
-    def write_folder(path, *content):
-        if full.is_set():
+    def full(path, *content):
+        if path.name in ("initial", "final", "00000") and len(problems) < 3:
             raise OSError(errno.ENOSPC, "No space left on device")
-        write(path, *content)
-
-    monkeypatch.setattr(storage, "write_folder", write_folder)
-    full.set()
-    person = Playing(Player(peer))
-    problems = []
+        return write(path, *content)
 
     def show(view, shown=person.show):
         shown(view)
         if view.problem is not None:
             problems.append(view)
-            if len(problems) == 3:
-                full.clear()
 
+    monkeypatch.setattr(storage, fails, full)
     person.show = show
     assert collect(sensor, tmp_path / "session", person, 2) == 2
     assert "No space left on device" in problems[0].problem
-    assert problems[0].stage is Stage.CLEAR
-    assert (problems[0].confirmed, problems[0].waiting) == (0, 3)
+    assert problems[0].stage is (Stage.HOLD if fails == "write_folder" else Stage.REVIEW)
+    assert problems[0].confirmed == 0
     for trajectory in hardware.load_recordings(tmp_path / "session"):
         check(trajectory, trajectory.number)
 

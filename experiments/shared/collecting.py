@@ -99,7 +99,6 @@ def collect(config: Collect) -> None:
                     )
                 except KeyboardInterrupt:
                     say("stopped")
-                session.flush()
                 say(f"{session.confirmed} confirmed trajectories in {session.folder}")
             if isinstance(sensor.camera, hardware.OpenCVCamera):
                 counts = sensor.camera.statistics

@@ -204,10 +204,10 @@ class CollectPage(Page[View]):
         """The instruction and the state of the recording."""
         if state is None:
             nothing: dict[str, Any] = {"number": None, "contact": False, "still": False, "problem": None, "ends": []}
-            counts = {"confirmed": 0, "waiting": 0, "count": self._count}
+            counts = {"confirmed": 0, "count": self._count}
             return {"stage": "", "instruction": "Connecting", "age_s": None, **nothing, **counts}
         pair = state.pair
-        names = ("instruction", "number", "confirmed", "waiting", "contact", "still", "problem")
+        names = ("instruction", "number", "confirmed", "contact", "still", "problem")
         return {
             **{name: getattr(state, name) for name in names},
             "stage": state.stage.value,

@@ -10,7 +10,7 @@ from sts_jax.hardware.camera import CameraLostError, CameraTimeoutError, FrozenC
 from sts_jax.hardware.guide import EmptyPad, GuideConfig, Stage
 from sts_jax.hardware.leds import DisconnectedError, LedTimeoutError
 from sts_jax.hardware.proof import LightError, Pair
-from sts_jax.hardware.session import Session, SessionError
+from sts_jax.hardware.session import Session
 
 _PASSING = (
     CameraLostError,
@@ -42,7 +42,6 @@ class View:
     still: bool  # True if nothing moves
     number: int | None  # number of the current trajectory, None: its initial pair was not taken yet
     confirmed: int  # number of trajectories of the session that are confirmed and on disk
-    waiting: int  # number of changes of the session that are not on disk yet
     problem: str | None  # message of the error that prevents collecting at present, or None
     initial: Pair | None  # initial pair of the current trajectory, None: not taken yet
     final: Pair | None  # final pair of the current trajectory, None: not taken yet
@@ -135,6 +134,7 @@ class _Collecting:
     def run(self, state: guide.State, count: int | None, patience_s: float) -> int:
         before = self._session.confirmed
         failing_since: float | None = None
+        refused: str | None = None  # error of the person's last action
         while count is None or before + self._confirmed < count:
             problem = self._not_ready(state)
             try:
@@ -148,15 +148,20 @@ class _Collecting:
                 state, pair, problem = guide.interrupted(state), None, str(error)
             if pair is not None:
                 if problem is None:
-                    state = self._observed(state, pair)
+                    try:
+                        state = self._observed(state, pair)
+                    except OSError as error:  # the pair could not be saved. The next pair tries again
+                        problem = str(error)
                 self._pair = pair
-            self._person.show(self._view(state, problem))
+            self._person.show(self._view(state, problem or refused))
             action = self._person.action()
             if action is Action.STOP:
                 break
             if action is not None and problem is None:
-                state = self._acted(state, action)
-        self._session.flush()
+                try:
+                    state, refused = self._acted(state, action), None
+                except OSError as error:
+                    refused = str(error)
         return self._confirmed
 
     def _not_ready(self, state: guide.State) -> str | None:
@@ -164,7 +169,7 @@ class _Collecting:
             return None
         try:
             self._session.check_ready()
-        except SessionError as error:
+        except OSError as error:
             return str(error)
         return None
 
@@ -206,7 +211,6 @@ class _Collecting:
             still=state.still,
             number=self._number,
             confirmed=self._session.confirmed,
-            waiting=self._session.waiting,
             problem=problem,
             initial=self._ends.get("initial"),
             final=self._ends.get("final"),

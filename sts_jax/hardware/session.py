@@ -10,13 +10,11 @@
 The folder of a pair appears when all its files are on disk. A trajectory with a `manifest.json` is confirmed.
 """
 
-import collections
 import contextlib
 import dataclasses
 import datetime
 import os
 import shutil
-import threading
 import time
 import urllib.parse
 from collections.abc import Callable, Iterator
@@ -41,9 +39,6 @@ _ENDS: tuple[End, End] = ("initial", "final")
 _STREAMS: tuple[Stream, Stream] = ("visual", "tactile")
 # Filters and Huffman codes only, because full deflate is slower and does not make noisy images smaller.
 _PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY)
-_JOBS_OF_TRAJECTORY = 3  # two pairs and the confirmation
-_QUEUE = 2 * _JOBS_OF_TRAJECTORY  # largest number of jobs that may wait
-_RETRY_S = 1.0  # wait after a failed attempt to write (s)
 
 Standing = Literal["confirmed", "unconfirmed", "incomplete", "discarded"]
 Image = UInt8[np.ndarray, "height width 3"]
@@ -353,17 +348,6 @@ def _remedy(number: int) -> str:
     return f"restore the file from a backup, or discard trajectory {number} with discard_recording()"
 
 
-class SessionError(OSError):
-    """Raised if a session cannot be written or cannot accept more changes. The message states cause and remedy."""
-
-
-class _Job(NamedTuple):
-    """A change of the session that the background thread writes to disk."""
-
-    name: str  # description for messages
-    run: Callable[[], None]  # function that writes the change
-
-
 class Session:
     """A folder to which trajectories are added.
 
@@ -375,13 +359,10 @@ class Session:
         ...
         session.save(number, "final", sensor.read())
         session.confirm(number)
-        session.flush()  # optional, `close` does it too
     ```
 
-    A background thread writes the files, so `save`, `confirm` and `discard` return at once. If writing fails, for
-    example because the disk is full, the thread tries again every second, and `problem` describes the error. At most
-    6 changes wait in memory, which is enough for two trajectories. Further ones raise a `SessionError`, which
-    `check_ready` before each trajectory avoids.
+    When `save`, `confirm` or `discard` returns, the change is on disk and survives a loss of power. If it raises an
+    OSError, for example because the disk is full, nothing has changed, and the call can be repeated.
     """
 
     def __init__(self, folder: str | os.PathLike, origin: Origin, *, settling: Settling | None = None):
@@ -400,50 +381,19 @@ class Session:
         self._next = next_recording(folder)
         self._confirmed = {entry.number for entry in list_recordings(folder) if entry.standing == "confirmed"}
         self._raw_bytes = 4 * 3 * origin.width * origin.height  # uncompressed size of a trajectory's images
-        self._changed = threading.Condition()
-        self._saved: set[tuple[int, End]] = set()  # pairs that were accepted
-        self._jobs: collections.deque[_Job] = collections.deque()  # the first one is being written
-        self._error: Exception | None = None  # error of the last attempt to write
-        self._closing = False
-        self._thread = threading.Thread(target=self._run, name="writer of the session", daemon=True)
-        self._thread.start()
 
     @property
     def confirmed(self) -> int:
-        """Number of confirmed trajectories that are on disk and survive a loss of power."""
-        with self._changed:
-            return len(self._confirmed)
-
-    @property
-    def waiting(self) -> int:
-        """Number of changes that are not on disk yet, such as confirmations and new pairs of images."""
-        with self._changed:
-            return len(self._jobs)
-
-    @property
-    def problem(self) -> str | None:
-        """Message of the error that prevents writing at present. None if there is no such error."""
-        with self._changed:
-            if self._error is None:
-                return None
-            return f"{str(self._error).rstrip('.')}. The session tries to write again every second."
+        """Number of confirmed trajectories."""
+        return len(self._confirmed)
 
     def check_ready(self) -> None:
-        """Raise a `SessionError` unless the session can accept a whole trajectory now."""
-        if (problem := self.problem) is not None:
-            raise SessionError(
-                f"cannot start a new trajectory, because {self.waiting} changes are not on disk yet. Error: {problem}"
-            )
-        if (waiting := self.waiting) > _QUEUE - _JOBS_OF_TRAJECTORY:
-            raise SessionError(
-                f"cannot start a new trajectory, because the disk is too slow: {waiting} changes are not on disk yet. "
-                "Wait until they are written, for example with flush()."
-            )
+        """Raise an OSError unless there is enough space for a whole trajectory."""
         free = shutil.disk_usage(self.folder).free
-        if free < self._raw_bytes * 2:  # for the new trajectory and for one that may wait
-            raise SessionError(
+        if free < self._raw_bytes:
+            raise OSError(
                 f"cannot start a new trajectory, because only {free / 1e6:.0f} MB are free in {self.folder}, but at "
-                f"least {2 * self._raw_bytes / 1e6:.0f} MB must be free: free some disk space."
+                f"least {self._raw_bytes / 1e6:.0f} MB must be free: free some disk space."
             )
 
     def begin(self) -> int:
@@ -452,119 +402,44 @@ class Session:
         return number
 
     def save(self, number: int, end: End, pair: Pair) -> None:
-        """Write a pair of images to disk in the background.
+        """Write a pair of images.
 
         Args:
             number: Number of the trajectory, from `begin`.
             end: "initial" for the held object, "final" for the object at rest.
             pair: The images.
         """
-        folder = _trajectory(self.folder, number)
         facts: dict[str, Any] = {shot.stream: shot_facts(shot) for shot in (pair.visual, pair.tactile)}
-        settling = None if self._settling is None else dataclasses.asdict(self._settling)
-
-        def write() -> None:
-            if not (folder / end).exists():
-                storage.write_folder(folder / end, encoded_pair(pair), {**facts, "settling": settling})
-            storage.flush_folder(folder)
-            storage.flush_folder(folder.parent)
-
-        self._add(_Job(f"the {end} pair of trajectory {number}", write))
-        self._saved.add((number, end))
+        facts["settling"] = None if self._settling is None else dataclasses.asdict(self._settling)
+        folder = _trajectory(self.folder, number)
+        storage.write_folder(folder / end, encoded_pair(pair), facts)
+        storage.flush_folder(folder.parent)
 
     def confirm(self, number: int, note: str = "") -> None:
-        """Confirm a trajectory in the background, after both of its pairs were saved.
+        """Confirm a trajectory, after both of its pairs were saved.
 
         Args:
             number: Number of the trajectory.
             note: Text that is stored with the trajectory.
         """
-        if missing := [end for end in _ENDS if (number, end) not in self._saved]:
-            raise ValueError(
-                f"trajectory {number} cannot be confirmed yet: call save() with the {' and the '.join(missing)} image "
-                "pair of this trajectory before confirm()"
-            )
-
-        def write() -> None:
-            _confirm(self.folder, number, note)
-            with self._changed:
-                self._confirmed.add(number)
-
-        self._add(_Job(f"the confirmation of trajectory {number}", write))
+        _confirm(self.folder, number, note)
+        self._confirmed.add(number)
 
     def discard(self, number: int) -> None:
-        """Move a trajectory to the folder `discarded`, in the background. Nothing is deleted."""
+        """Move a trajectory to the folder `discarded`. Nothing is deleted."""
+        with contextlib.suppress(FileNotFoundError):  # no pair of it was saved
+            _move(_trajectory(self.folder, number), _trajectory(self.folder, number, DISCARDED))
+        self._confirmed.discard(number)
 
-        def move() -> None:
-            with contextlib.suppress(FileNotFoundError):  # no pair of it was saved
-                _move(_trajectory(self.folder, number), _trajectory(self.folder, number, DISCARDED))
-            with self._changed:
-                self._confirmed.discard(number)
-
-        self._add(_Job(f"the move of trajectory {number} to {DISCARDED}", move))
-
-    def flush(self, timeout_s: float = 30.0) -> None:
-        """Wait until all changes are on disk. After `timeout_s`, a `SessionError` lists those that are not."""
-        with self._changed:
-            if self._changed.wait_for(lambda: not self._jobs, timeout_s):
-                return
-            names = ", ".join(job.name for job in self._jobs)
-            cause = self._error or "the disk is too slow. Pass a longer timeout_s."
-        raise SessionError(
-            f"these changes were not on disk after {timeout_s:g} s: {names}. They are lost if the session closes "
-            f"before they are written. Cause: {cause}"
-        )
-
-    def close(self, timeout_s: float = 30.0) -> None:
-        """Wait as `flush` does, end the background thread, and unlock the folder."""
-        try:
-            self.flush(timeout_s)
-        finally:
-            with self._changed:
-                self._closing = True
-                self._changed.notify_all()
-            self._thread.join(2 * _RETRY_S)
-            self._lock.close()
+    def close(self) -> None:
+        """Unlock the folder."""
+        self._lock.close()
 
     def __enter__(self) -> "Session":
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    def _add(self, job: _Job) -> None:
-        """Append a job to the queue of the background thread."""
-        with self._changed:
-            if self._closing:
-                raise SessionError(f"the session of {self.folder} is closed: make a new Session.")
-            if len(self._jobs) >= _QUEUE:
-                raise SessionError(
-                    f"{job.name} was not accepted, because {len(self._jobs)} changes are not on disk yet: wait with "
-                    "flush() and try again. To avoid this error, call check_ready() before each trajectory."
-                )
-            self._jobs.append(job)
-            self._changed.notify_all()
-
-    def _run(self) -> None:
-        """Write the jobs in order, each until it succeeds."""
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._jobs or self._closing)
-                if self._closing:  # `close` has already waited for the jobs
-                    return
-                job = self._jobs[0]
-            error: Exception | None = None
-            try:
-                job.run()
-            except Exception as failed:  # kept in `self._error` for the caller, and the job is tried again
-                error = failed
-            with self._changed:
-                self._error = error
-                if error is None:
-                    self._jobs.popleft()
-                else:
-                    self._changed.wait_for(lambda: self._closing, _RETRY_S)
-                self._changed.notify_all()
 
 
 def recorded_images(
