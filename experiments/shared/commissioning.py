@@ -182,7 +182,7 @@ def opened(config: Config) -> Iterator[tuple[hardware.OpenCVCamera, hardware.Led
         config.camera, config.width, config.height, fps=config.fps, fourcc=config.fourcc, buffer=8
     )
     with hardware.Leds.connect(config.leds) as leds:
-        say(f"LED controller {leds.serial_number}: {leds.board}, firmware {leds.firmware}")
+        say(f"LED controller {leds.serial_number}: {leds.controller.board}, firmware {leds.controller.firmware}")
         with hardware.OpenCVCamera(dataclasses.replace(source, lock=source.kind == "device")) as camera:
             while camera.statistics.rate is None:
                 camera.async_read()

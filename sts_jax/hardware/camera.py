@@ -75,6 +75,7 @@ class Camera(Protocol):
     """A camera. Write a class with these methods to read a camera that OpenCV does not support, and pass it to `STS`.
 
     A backend whose driver can set the exposure also has `set_exposure(exposure) -> float | None`, see `OpenCVCamera`.
+    A camera that was lost raises a `CameraLostError` until it is found again.
     """
 
     @property
@@ -86,10 +87,10 @@ class Camera(Protocol):
         """True after `connect`."""
 
     def connect(self, warmup_s: float = 1.0) -> object:
-        """Open the camera, wait `warmup_s`, and then keep exposure, white balance and focus constant."""
+        """Open the camera, and after `warmup_s` (s) keep exposure, white balance and focus constant."""
 
     def read(self, timeout_ms: float | None = None) -> Captured:
-        """Return a frame whose exposure began after the start of this call."""
+        """Return a frame whose exposure began after the start of this call, or raise a `CameraTimeoutError`."""
 
     def async_read(self, timeout_ms: float | None = None) -> Captured:
         """Return the oldest frame that was not returned yet, or wait for the next one."""

@@ -96,11 +96,15 @@ class Leds:
 
     A request takes at most `answer_s`, and 0.3 s more if the port accepts no bytes or sends bytes without end. The
     first request after a restart of the controller takes at most twice as long.
+
+    Attributes:
+        port: Name of the serial port.
+        controller: Description of the controller: its firmware, its board and its serial number.
     """
 
     def __init__(self, port: str, *, baud: int, timeout_s: float, answer_s: float, watchdog_ms: int):
         """Use `Leds.connect`."""
-        self._port = port
+        self.port = port
         self._baud = baud
         self._timeout_s = timeout_s
         self._answer_s = answer_s
@@ -109,7 +113,7 @@ class Leds:
         self._thread: threading.Thread | None = None
         self._boot: int | None = None
         self._open = False
-        connection, self._controller = self._handshake(port)
+        connection, self.controller = self._handshake(port)
         self._start(connection)
 
     @classmethod
@@ -167,24 +171,9 @@ class Leds:
         )
 
     @property
-    def port(self) -> str:
-        """Name of the serial port, such as `/dev/ttyACM0`."""
-        return self._port
-
-    @property
     def serial_number(self) -> str:
         """Serial number that the controller reports."""
-        return self._controller.serial_number
-
-    @property
-    def firmware(self) -> str:
-        """Version of the controller's firmware, such as "1.0.0"."""
-        return self._controller.firmware
-
-    @property
-    def board(self) -> str:
-        """Name of the controller's board, such as "atmega328p"."""
-        return self._controller.board
+        return self.controller.serial_number
 
     def set(self, levels: Sequence[int]) -> Lit:
         """Set the lights and wait until the controller has applied the levels.
@@ -199,7 +188,7 @@ class Leds:
         checked = checked_levels(levels)
         lit = self._state(functools.partial(protocol.Set, levels=checked))
         if lit.levels != checked:
-            raise LedError(f"the LED controller on {self._port} applied {lit.levels} instead of {checked}. {_FLASH}")
+            raise LedError(f"the LED controller on {self.port} applied {lit.levels} instead of {checked}. {_FLASH}")
         return lit
 
     def ping(self) -> Lit:
@@ -214,7 +203,7 @@ class Leds:
         try:
             self.set(protocol.DARK)
         except LedError as error:
-            _log.warning("the lights on %s were not turned off, so the watchdog does it: %s", self._port, error)
+            _log.warning("the lights on %s were not turned off, so the watchdog does it: %s", self.port, error)
         self._stop()
 
     def reconnect(self, *, limit_s: float = 30.0) -> None:
@@ -238,7 +227,7 @@ class Leds:
                         connection.close()
                         tried[name] = f"controller {controller.serial_number}"
                         continue
-                    self._port, self._controller, self._boot = name, controller, None
+                    self.port, self.controller, self._boot = name, controller, None
                     self._usb = _usb_port(name) or self._usb
                     self._start(connection)
                     return
@@ -278,7 +267,7 @@ class Leds:
             raise
         self._open = True
         self._thread = threading.Thread(
-            target=self._keep_alive, args=(connection,), name=f"keep-alive of {self._port}", daemon=True
+            target=self._keep_alive, args=(connection,), name=f"keep-alive of {self.port}", daemon=True
         )
         self._thread.start()
 
@@ -318,7 +307,7 @@ class Leds:
 
     def _candidates(self) -> list[str]:
         """The names of the ports on which `reconnect` searches for the controller, in order."""
-        names = [self._port]
+        names = [self.port]
         if (usb := self._usb) is not None:
             alike = [port for port in find_controllers() if (port.vendor, port.product) == (usb.vendor, usb.product)]
             alike.sort(key=lambda port: port.serial_number != usb.serial_number)
@@ -351,7 +340,10 @@ class Connection:
                 f"no LED controller answered on {self.name} within {timeout_s:g} s. {self._description()}"
             ) from error
         if reply.version != protocol.VERSION:
-            raise self._wrong_version(f"version {reply.version}")
+            raise LedError(
+                f"the LED controller on {self.name} uses version {reply.version} of the protocol instead of "
+                f"{protocol.VERSION}. {_FLASH}"
+            )
         return reply
 
     def exchange(
@@ -384,7 +376,10 @@ class Connection:
                     if isinstance(reply, protocol.Refused) and reply.sequence in (0, self._sequence):
                         if reply.sequence == 0:  # the request was damaged on its way, so it is sent again
                             break
-                        raise self._refusal(reply, line)
+                        raise LedError(
+                            f"the LED controller on {self.name} refused the request {line.decode().strip()!r}: "
+                            f"{reply.text}. {_FLASH}"
+                        )
                     if isinstance(reply, answer) and reply.sequence == self._sequence:
                         self.answered_s = time.monotonic()
                         return reply, sent_s, self.answered_s
@@ -466,32 +461,15 @@ class Connection:
             f"the port {self.name} is gone or closed ({error}): check the cable, then call `reconnect()`."
         )
 
-    def _refusal(self, reply: protocol.Refused, line: bytes) -> LedError:
-        if reply.code == protocol.Code.VERSION:
-            return self._wrong_version(reply.text)
-        return LedError(
-            f"the LED controller on {self.name} refused the request {line.decode().strip()!r} with error "
-            f"{int(reply.code)} ({reply.text}). {_FLASH}"
-        )
-
-    def _wrong_version(self, other: str) -> LedError:
-        return LedError(
-            f"the LED controller on {self.name} uses another version of the protocol ({other}) than "
-            f"{protocol.VERSION}. {_FLASH}"
-        )
-
     def _description(self) -> str:
         """What was received instead of an answer, for an error message."""
         heard = self._heard + self._buffer
         if not heard:
             return "Nothing was received: check the cable and the name of the port, and flash the firmware."
-        strange = sum(not (32 <= byte < 127 or byte in b"\t\r\n") for byte in heard)
-        if 5 * strange > len(heard):
-            return (
-                f"Received {len(heard)} bytes that are not text ({heard[:24]!r}): the baud rate may be wrong (opened "
-                f"at {self.baud} baud, the firmware uses {protocol.BAUD})."
-            )
-        return f"Received {heard[:80]!r}: another device may be on this port."
+        return (
+            f"Received {heard[:80]!r}: another device may be on this port, or the baud rate ({self.baud}) is not that "
+            f"of the firmware ({protocol.BAUD})."
+        )
 
 
 _FLASH = "Flash the firmware of this version of sts_jax with `make flash PORT=...` in sts_jax/hardware/firmware."

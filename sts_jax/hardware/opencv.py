@@ -37,7 +37,6 @@ FIRST_WAIT_S = 0.25  # s, wait before a lost source is opened again. It doubles 
 LONGEST_WAIT_S = 5.0  # s, longest of these waits
 
 _MJPG = cv2.VideoWriter.fourcc(*"MJPG")
-_VIDEO = 81  # Linux's major number of video devices
 _TAIL = 1024  # bytes within which a complete JPEG image ends with its marker
 _RATE_TOLERANCE = 0.02  # share by which a driver may round the frame rate
 
@@ -100,16 +99,8 @@ class OpenCVCamera:
         self._refused: list[str] = []  # settings that the driver did not accept
 
     def connect(self, warmup_s: float = 1.0) -> "OpenCVCamera":
-        """Open the camera, and wait for its automatic exposure and white balance to settle before they are locked.
-
-        A setting that the source does not accept is a warning.
-
-        Args:
-            warmup_s: Time for the automatic control to settle (s).
-        """
+        """See `Camera.connect`. A setting that the source does not accept is a warning."""
         config = self.config
-        if not 0 <= warmup_s < math.inf:
-            raise ValueError(f"warmup_s must be >= 0 and finite, got {warmup_s}")
         if not self._stop.is_set() or (self._thread is not None and self._thread.is_alive()):
             raise CameraError(f"{config.name} is connected already, or its driver does not respond.")
         self._reset()
@@ -118,7 +109,11 @@ class OpenCVCamera:
         self._thread.start()
         atexit.register(self.disconnect)  # a thread that is inside OpenCV must not outlive the interpreter
         try:
-            self._wait_for_first_frame()
+            limit_s = 3 * config.timeout_s
+            with self._changed:
+                self._changed.wait_for(lambda: self._newest is not None or self._problem is not None, limit_s)
+                if self._newest is None:
+                    raise self._error(limit_s)
             time.sleep(warmup_s)
             if config.kind == "device" and config.lock:
                 self._between_frames(self._lock_settings)
@@ -136,13 +131,6 @@ class OpenCVCamera:
             self._end()
             raise
         return self
-
-    def _wait_for_first_frame(self) -> None:
-        limit_s = 3 * self.config.timeout_s
-        with self._changed:
-            self._changed.wait_for(lambda: self._newest is not None or self._problem is not None, limit_s)
-            if self._newest is None:
-                raise self._error(limit_s)
 
     def disconnect(self) -> None:
         """Close the camera. A driver that does not respond for `timeout_s` closes it later, which is a warning."""
@@ -208,43 +196,18 @@ class OpenCVCamera:
         return self._held.get("exposure")
 
     def read(self, timeout_ms: float | None = None) -> Captured:
-        """Return a frame whose exposure began after the start of this call.
-
-        The first `CameraConfig.in_flight` frames that arrive after the start of the call are discarded, because their
-        exposure may have begun earlier, and so are delayed frames.
-
-        Args:
-            timeout_ms: Longest wait (ms), also for a lost camera. None: `CameraConfig.timeout_s`.
-
-        Raises:
-            CameraTimeoutError: No such frame has arrived in time.
-            CameraLostError: The camera was lost during the call, or was not found again in time.
-            FrozenCameraError: The camera has sent the same image for longer than `CameraConfig.frozen_after_s`.
-            FrameSizeError: The size of the camera's frames has changed.
-        """
+        """See `Camera.read`. The first `in_flight` frames that arrive after the start of the call are discarded."""
         with self._changed:
             first = self._next + self.config.in_flight
             return self._wait(timeout_ms, lambda frame: frame.sequence >= first and not frame.delayed)
 
     def async_read(self, timeout_ms: float | None = None) -> Captured:
-        """Return the oldest frame that was not returned yet, or wait for the next one.
-
-        The newest `CameraConfig.buffer` frames are kept. A frame may have been exposed before the call.
-
-        Args:
-            timeout_ms: Longest wait (ms). None: `CameraConfig.timeout_s`.
-        """
+        """See `Camera.async_read`. The newest `CameraConfig.buffer` frames are kept."""
         with self._changed:
             return self._wait(timeout_ms, lambda frame: True)
 
     def read_latest(self, max_age_ms: float = 500.0) -> Captured:
-        """Return the newest frame without waiting. The same frame may be returned several times.
-
-        Args:
-            max_age_ms: Largest allowed time since the frame's arrival (ms).
-        """
-        if not max_age_ms > 0:
-            raise ValueError(f"max_age_ms must be > 0, got {max_age_ms}")
+        """See `Camera.read_latest`. The same frame may be returned several times."""
         with self._changed:
             if self._newest is None or self._problem is not None or self._stop.is_set():
                 raise self._error(0.0)
@@ -259,8 +222,6 @@ class OpenCVCamera:
 
     def _wait(self, timeout_ms: float | None, wanted: Callable[[Captured], bool]) -> Captured:
         """Return the next wanted frame of the queue, and discard those before it."""
-        if timeout_ms is not None and not timeout_ms > 0:
-            raise ValueError(f"timeout_ms must be > 0, got {timeout_ms}")
         limit_s = self.config.timeout_s if timeout_ms is None else timeout_ms / 1000
         deadline = time.monotonic() + limit_s
         epoch, lost_before = self._epoch, self._is_lost()
@@ -379,7 +340,7 @@ class OpenCVCamera:
                     self._counts["damaged"] += 1
                 continue
             if image.shape[1::-1] != capture.size:
-                self._set_problem(FrameSizeError, size_message(config, image.shape[1::-1], capture.size))
+                self._set_problem(FrameSizeError, _size_message(config, image.shape[1::-1], capture.size))
                 continue
             if previous is not None and _identical(image, previous.image):
                 repeats += 1
@@ -458,14 +419,12 @@ class Capture:
         """Request format, size and rate, and check the size."""
         config, device = self._config, self.device
         if not device.isOpened():
-            remedy = "check the address, the path and the password, and that its server sends video."
-            if config.kind == "device" and not Path(config.path).exists():
-                remedy = f"there is no such device. {cameras_found()}"
-            elif config.kind == "device":
-                remedy = (
-                    f"another process may use {config.path} (`fuser {config.path}`), your user may not be in the group "
-                    f"video, or it is no camera. {cameras_found()}"
-                )
+            remedy = (
+                f"it is missing, another process uses it (`fuser {config.path}`), your user is not in the group video, "
+                f"or it is no camera. {cameras_found()}"
+            )
+            if config.kind == "stream":
+                remedy = "check the address, the path and the password, and that its server sends video."
             raise CameraError(f"{config.name} cannot be opened: {remedy}")
         if config.kind == "device":
             if config.fourcc is not None:
@@ -485,7 +444,7 @@ class Capture:
             self._jpeg = device.set(cv2.CAP_PROP_FORMAT, -1)
         self.size = round(device.get(cv2.CAP_PROP_FRAME_WIDTH)), round(device.get(cv2.CAP_PROP_FRAME_HEIGHT))
         if config.width is not None and config.height is not None and self.size != (config.width, config.height):
-            raise FrameSizeError(size_message(config, self.size, (config.width, config.height)))
+            raise FrameSizeError(_size_message(config, self.size, (config.width, config.height)))
 
     def _fourcc(self) -> int:
         return int(self.device.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF
@@ -537,14 +496,11 @@ def _open(config: CameraConfig) -> cv2.VideoCapture:
     return cv2.VideoCapture(config.path, cv2.CAP_FFMPEG, parameters)
 
 
-def size_message(config: CameraConfig, size: tuple[int, ...], wanted: tuple[int, int]) -> str:
-    """Message for frames of another size (width, height) than the wanted one."""
-    remedy = "give CameraConfig this size, or let the server send the other one"
-    if config.kind == "device":
-        remedy = f"choose a size that `v4l2-ctl -d {config.path} --list-formats-ext` lists (some need fourcc='MJPG')"
+def _size_message(config: CameraConfig, size: tuple[int, ...], wanted: tuple[int, int]) -> str:
     return (
         f"{config.name} sends frames of {size[0]} x {size[1]} pixels, but {wanted[0]} x {wanted[1]} were asked for: "
-        f"{remedy}."
+        f"give CameraConfig a size that it sends (`v4l2-ctl -d {config.path} --list-formats-ext` lists those of a "
+        "device, and some need fourcc='MJPG'), or change it at the stream's server."
     )
 
 

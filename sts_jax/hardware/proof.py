@@ -88,14 +88,9 @@ def thumbnail(image: UInt8[np.ndarray, "height width 3"]) -> Thumbnail:
     return cv2.resize(image, _SIZE, interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
-def difference(first: Thumbnail, second: Thumbnail) -> float:
-    """Mean absolute difference between two thumbnails, 0 to 255."""
-    return float(np.abs(first - second).mean())
-
-
 def check_contrast(dark: Thumbnail, lit: Thumbnail) -> None:
     """Raise a `LightError` if the lights do not change the image."""
-    contrast = difference(dark, lit)
+    contrast = float(np.abs(dark - lit).mean())
     if contrast < _LEAST_CONTRAST:
         raise LightError(
             f"the images with the lights off and on differ by {contrast:.2f} of 255 on average, but they must differ "

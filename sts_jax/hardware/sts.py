@@ -63,6 +63,11 @@ class STS:
     - It was not delayed, repeats no earlier frame, and is not black after an image of the same stream that was not.
 
     All other frames are discarded. Only one thread may use a sensor at a time.
+
+    Attributes:
+        camera: The `Camera` that takes the images.
+        levels: Duty cycles of the four LED channels in the tactile stream, 0 (off) to 255 (always on).
+        device: The content of the sensor file. None if the sensor was not made by `from_file`.
     """
 
     def __init__(
@@ -92,7 +97,7 @@ class STS:
         """
         if exposures is not None and not min(exposures) > 0:
             raise ValueError(f"exposures must be two numbers > 0 (visual, tactile) or None, got {exposures}")
-        self._levels = checked_levels(levels)
+        self.levels = checked_levels(levels)
         for name, value in (("timeout_s", timeout_s), ("reconnect_s", reconnect_s)):
             if not 0 < value < float("inf"):
                 raise ValueError(f"{name} must be positive and finite, got {value}")
@@ -100,12 +105,12 @@ class STS:
             camera = CameraConfig(camera)
         if isinstance(camera, CameraConfig):
             camera = OpenCVCamera(dataclasses.replace(camera, buffer=max(camera.buffer, _BUFFER)))
-        self._camera: Camera = camera
+        self.camera: Camera = camera
         self._port = leds.port if isinstance(leds, Leds) else leds
         self._leds: Leds | None = leds if isinstance(leds, Leds) else None
         self._settling = settling
         self._exposures = exposures
-        self._device: Device | None = None
+        self.device: Device | None = None
         self._timeout_s, self._reconnect_s = timeout_s, reconnect_s
         self._frames: ProvenFrames | None = None  # None before the first `connect`
 
@@ -147,18 +152,8 @@ class STS:
             timeout_s=timeout_s,
             reconnect_s=reconnect_s,
         )
-        sensor._device = device
+        sensor.device = device
         return sensor
-
-    @property
-    def device(self) -> Device | None:
-        """The content of the sensor file. None if the sensor was not made by `from_file`."""
-        return self._device
-
-    @property
-    def camera(self) -> Camera:
-        """The `Camera` that takes the sensor's images."""
-        return self._camera
 
     @property
     def leds(self) -> Leds:
@@ -166,11 +161,6 @@ class STS:
         if self._leds is None:
             raise CameraError("the sensor is not connected: call connect() first.")
         return self._leds
-
-    @property
-    def levels(self) -> protocol.Levels:
-        """Duty cycles of the four LED channels in the tactile stream, 0 (off) to 255 (always on)."""
-        return self._levels
 
     @property
     def discarded(self) -> int:
@@ -197,19 +187,19 @@ class STS:
             WrongDeviceError: The LED controller is not the controller that the sensor file names.
         """
         if self._leds is None:
-            if self._device is not None and not self._port:
-                self._leds = Leds.find(self._device.leds)
+            if self.device is not None and not self._port:
+                self._leds = Leds.find(self.device.leds)
             else:
                 self._leds = Leds.connect(self._port)
         try:
-            if self._device is not None:
-                self._device.check_identity(leds=self._leds.serial_number)
-            if not self._camera.is_connected:
-                self._camera.connect(warmup_s)
+            if self.device is not None:
+                self.device.check_identity(leds=self._leds.serial_number)
+            if not self.camera.is_connected:
+                self.camera.connect(warmup_s)
             self._frames = ProvenFrames(
-                self._camera,
+                self.camera,
                 self._leds,
-                levels=self._levels,
+                levels=self.levels,
                 exposures=self._exposures,
                 timeout_s=self._timeout_s,
                 reconnect_s=self._reconnect_s,
@@ -228,7 +218,7 @@ class STS:
         leds, self._leds = self._leds, None
         if leds is not None:
             leds.close()
-        self._camera.disconnect()
+        self.camera.disconnect()
 
     def read(self, timeout_ms: float | None = None) -> Pair:
         """Take one image of each stream. Both frames arrive after the start of the call.
@@ -281,7 +271,7 @@ class STS:
         return self._settling
 
     def __enter__(self) -> "STS":
-        return self if self._leds is not None and self._camera.is_connected else self.connect()
+        return self if self._leds is not None and self.camera.is_connected else self.connect()
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
