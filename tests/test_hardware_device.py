@@ -52,19 +52,6 @@ def test_pairs_are_of_the_right_light(peer, sensor):
     assert len(set(numbers)) == len(numbers)  # no frame is returned twice
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("lag_s", "exposure_s"), [(0.015, 0.002), (0.12, 0.016)])
-def test_measured_settling_covers_lag_and_exposure(tmp_path, lag_s, exposure_s):
-    peer = SensorPeer(tmp_path / "leds", lag_s=lag_s, exposure_s=exposure_s)
-    try:
-        with hardware.STS(camera=config(peer.url), leds=peer.path).connect(0.2) as sensor:
-            assert sensor.settling.visual_s > lag_s + exposure_s
-            assert sensor.settling.tactile_s > lag_s + exposure_s
-            assert all(judged(peer, shot) for _ in range(10) for shot in _both(sensor.read()))
-    finally:
-        peer.stop()
-
-
 def _both(pair):
     return pair.visual, pair.tactile
 
@@ -271,22 +258,13 @@ def test_a_camera_of_another_backend_is_a_sensor(peer):
     assert not camera.is_connected
 
 
-def test_a_controller_that_returns_is_found_again(tmp_path, peer, sensor):
-    sensor.read()
-    peer.unplug()
-    threading.Timer(0.5, lambda: peer.plug_in(tmp_path / "leds")).start()
-    assert all(judged(peer, shot) for shot in _both(sensor.read()))
-
-
-def test_a_reconnection_extends_the_limit_of_both_images(tmp_path, peer):
+def test_a_controller_that_returns_is_found_again_and_extends_the_limit(tmp_path, peer):
     given = config(peer.url, frozen_after_s=None)
     with hardware.STS(camera=given, leds=peer.path, settling=SETTLING, timeout_s=1.0).connect(0.2) as sensor:
         sensor.read()
         peer.unplug()
         threading.Timer(2.5, lambda: peer.plug_in(tmp_path / "leds")).start()
-        began_s = time.monotonic()
-        assert all(judged(peer, shot) for shot in _both(sensor.read()))
-        assert time.monotonic() - began_s > 2  # longer than the limit of a pair without a reconnection
+        assert all(judged(peer, shot) for shot in _both(sensor.read()))  # longer than the limit of a pair, 2 s
 
 
 def test_a_sensor_of_an_open_controller_connects_again(peer):
@@ -340,12 +318,13 @@ def test_bad_calls_are_refused(sensor):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("lag_s", [0.015, 0.05, 0.12])
-def test_many_pairs_have_no_wrong_or_mixed_light(tmp_path, lag_s):
-    peer = SensorPeer(tmp_path / "leds", lag_s=lag_s, exposure_s=0.016)
+@pytest.mark.parametrize(("lag_s", "exposure_s"), [(0.015, 0.002), (0.05, 0.016), (0.12, 0.016)])
+def test_many_pairs_have_no_wrong_or_mixed_light(tmp_path, lag_s, exposure_s):
+    peer = SensorPeer(tmp_path / "leds", lag_s=lag_s, exposure_s=exposure_s)
     try:
         with hardware.STS(camera=config(peer.url), leds=peer.path).connect(0.2) as sensor:
-            assert all(judged(peer, shot) for _ in range(120) for shot in _both(sensor.read()))
+            assert min(sensor.settling.visual_s, sensor.settling.tactile_s) > lag_s + exposure_s
+            assert all(judged(peer, shot) for _ in range(100) for shot in _both(sensor.read()))
     finally:
         peer.stop()
 

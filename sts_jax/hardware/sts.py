@@ -1,10 +1,9 @@
 """`STS`: camera and lights as one sensor. The lights do not change during the exposure of a returned image."""
 
 import dataclasses
-import itertools
 import os
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
@@ -244,20 +243,50 @@ class STS:
         """Return an endless iterator over images of both streams. Each step waits for at most `timeout_s`.
 
         Args:
-            duty: Share of tactile images, 0 to 1.
+            duty: Share of tactile images, 0 to 1. After each group, the share so far is as close to it as possible.
             dwell: Number of successive images of one stream, >= 1. Each switch costs the settling time.
         """
-        order = stream_order(duty, dwell)
-        return (self._connected.shot(stream, time.monotonic() + self._timeout_s) for stream in order)
+        if not 0 <= duty <= 1:
+            raise ValueError(f"duty, the share of tactile images, must be in [0, 1], got {duty}")
+        if dwell < 1:
+            raise ValueError(f"dwell must be >= 1, got {dwell}")
+        return self._images(duty, dwell)
+
+    def _images(self, duty: float, dwell: int) -> Iterator[Shot]:
+        number = tactile = 0
+        while True:
+            stream: Stream = "tactile" if tactile + 0.5 < duty * (number + 1) + 1e-9 else "visual"
+            number, tactile = number + 1, tactile + (stream == "tactile")
+            for _ in range(dwell):
+                yield self._connected.shot(stream, time.monotonic() + self._timeout_s)
 
     def wait_until_still(self, timeout_s: float = 10.0, *, window_s: float = 0.5) -> Shot:
-        """Wait until nothing moves in the visual stream, see `first_still`.
+        """Wait until the visual stream has been still for `window_s`, and return the last image of this period.
+
+        The view counts as still if no pixel of the `thumbnail` differs from the beginning of the period by more than 8
+        times the median difference, or by more than 6 of 255.
 
         Args:
             timeout_s: Time after the first image at which the method gives up with a `TimeoutError` (s).
             window_s: Time during which the view must not change (s).
         """
-        return first_still(self.stream(0.0), timeout_s, window_s)
+        shots = self.stream(0.0)
+        first = last = next(shots)
+        started_s, look, change, allowed = first.time_s, thumbnail(first.image), 0.0, _STILL
+        while last.time_s - started_s <= timeout_s:
+            last = next(shots)
+            now = thumbnail(last.image)
+            changes = np.abs(now - look)
+            change, allowed = float(changes.max()), max(_STILL, _NOISE * float(np.median(changes)))
+            if change > allowed or last.epoch != first.epoch:
+                first, look = last, now
+            elif last.time_s - first.time_s >= window_s:
+                return last
+        raise TimeoutError(
+            f"within {timeout_s:g} s, there was no period of {window_s:g} s without movement: the last image differs "
+            f"from the first one of its period by {change:.2f} of 255, and {allowed:.2f} are allowed. Keep the scene "
+            "at rest, raise timeout_s, or check whether the light of the room changes."
+        )
 
     def measure_settling(self, switches: int = 8, *, watch_s: float = 1.0) -> Settling:
         """Measure the settling times, and use them from now on. The scene must be at rest.
@@ -283,59 +312,6 @@ class STS:
         if self._leds is None or self._frames is None:
             raise CameraError("the sensor is not connected: call connect() first.")
         return self._frames
-
-
-def stream_order(duty: float, dwell: int) -> Iterator[Stream]:
-    """Return an endless iterator that chooses the stream of each successive image.
-
-    Args:
-        duty: Share of tactile images, 0 to 1. After each group, the share so far is as close to `duty` as possible.
-        dwell: Number of successive images in a group, >= 1. All images of a group are of the same stream.
-    """
-    if not 0 <= duty <= 1:
-        raise ValueError(f"duty, the share of tactile images, must be in [0, 1], got {duty}")
-    if dwell < 1:
-        raise ValueError(f"dwell must be >= 1, got {dwell}")
-
-    def order() -> Iterator[Stream]:
-        number = tactile = 0
-        while True:
-            stream: Stream = "tactile" if tactile + 0.5 < duty * (number + 1) + 1e-9 else "visual"
-            number, tactile = number + 1, tactile + (stream == "tactile")
-            yield from itertools.repeat(stream, dwell)
-
-    return order()
-
-
-def first_still(shots: Iterable[Shot], timeout_s: float, window_s: float) -> Shot:
-    """Wait until the view has been still for `window_s` seconds, and return the last image of this period.
-
-    The view counts as still if no pixel of the `thumbnail` differs from the beginning of the period by more than 8
-    times the median difference, or by more than 6 of 255.
-
-    Args:
-        shots: Successive images of the visual stream.
-        timeout_s: Time after the first image at which a `TimeoutError` is raised (s).
-        window_s: Time during which the view must not change (s).
-    """
-    started_s: float | None = None
-    first, look, change, allowed = None, None, 0.0, _STILL
-    for shot in shots:
-        now = thumbnail(shot.image)
-        changes = np.zeros(1) if look is None else np.abs(now - look)
-        change, allowed = float(changes.max()), max(_STILL, _NOISE * float(np.median(changes)))
-        started_s = shot.time_s if started_s is None else started_s
-        if first is None or look is None or change > allowed or shot.epoch != first.epoch:
-            first, look = shot, now
-        elif shot.time_s - first.time_s >= window_s:
-            return shot
-        if shot.time_s - started_s > timeout_s:
-            break
-    raise TimeoutError(
-        f"within {timeout_s:g} s, there was no period of {window_s:g} s without movement: the last image differs from "
-        f"the first one of its period by {change:.2f} of 255, and {allowed:.2f} are allowed. Keep the scene at rest, "
-        "raise timeout_s, or check whether the light of the room changes."
-    )
 
 
 def checked_levels(levels: Sequence[int]) -> protocol.Levels:
