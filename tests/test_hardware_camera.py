@@ -111,30 +111,17 @@ def test_read_discards_frames_that_the_network_held_back(server):
         assert server.served[number_of(frame.image)] > called
 
 
-def test_async_read_returns_new_frames_in_order(server):
-    with connected(server) as camera:
-        frames_read = [camera.async_read() for _ in range(40)]
-    sequences = [frame.sequence for frame in frames_read]
-    times = [frame.time_s for frame in frames_read]
-    numbers = [number_of(frame.image) for frame in frames_read]
-    assert np.all(np.diff(sequences) > 0)
-    assert np.all(np.diff(times) > 0)
-    assert np.array_equal(np.diff(numbers), np.diff(sequences))  # each frame of the server has one number here
-    assert {frame.epoch for frame in frames_read} == {0}
-
-
-def test_a_buffer_keeps_every_frame_for_a_slow_reader(server):
+def test_async_read_returns_every_frame_in_order_and_without_a_buffer_the_newest(server):
     with connected(server, buffer=50) as camera:
         time.sleep(0.4)
-        numbers = [number_of(camera.async_read().image) for _ in range(20)]
+        frames = [camera.async_read() for _ in range(30)]
         assert camera.statistics.skipped == 0
-    assert np.all(np.diff(numbers) == 1)
-
-
-def test_frames_that_nobody_fetches_are_counted_as_skipped(server):
+    assert np.all(np.diff([number_of(frame.image) for frame in frames]) == 1)
+    assert np.all(np.diff([frame.sequence for frame in frames]) == 1)
+    assert np.all(np.diff([frame.time_s for frame in frames]) > 0)
+    assert {frame.epoch for frame in frames} == {0}
     with connected(server) as camera:
         assert wait_until(lambda: camera.statistics.skipped > 5)
-        assert camera.statistics.dropped == 0
 
 
 def test_images_are_rgb_and_read_only():
@@ -351,7 +338,7 @@ def test_a_camera_connects_again_after_disconnect(server):
 
 
 @pytest.mark.slow
-def test_a_hundred_random_faults_lead_to_errors_and_back_to_frames(server):
+def test_random_faults_lead_to_errors_and_back_to_frames(server):
     rng = random.Random(0)
     expected = {
         "stall": (CameraLostError, CameraTimeoutError),
@@ -363,7 +350,7 @@ def test_a_hundred_random_faults_lead_to_errors_and_back_to_frames(server):
     }
     epoch, number, sequence = 0, 0, -1
     with connected(server, timeout_s=1.0, frozen_after_s=0.3) as camera:
-        for _ in range(100):
+        for _ in range(40):
             fault = rng.choice(list(expected))
             if fault == "refuse":
                 server.stop()
@@ -409,20 +396,13 @@ def test_a_stream_of_another_size_is_refused(server):
 
 
 def test_a_stream_warns_that_its_exposure_is_not_locked(server):
-    with pytest.warns(UserWarning, match=r"AUTO_EXPOSURE and AUTO_WB cannot be turned off.*lock=False"):
-        connected(server, lock=True).disconnect()
-
-
-def test_a_warning_that_is_an_error_leaves_no_thread(server):
-    with pytest.raises(UserWarning, match="AUTO_EXPOSURE"):
+    with pytest.raises(UserWarning, match=r"AUTO_EXPOSURE and AUTO_WB cannot be turned off.*lock=False"):
         connected(server, lock=True)
     assert not camera_threads()
 
 
 def test_a_password_is_not_shown():
-    name = CameraConfig("rtsp://user:secret@10.0.0.1/live").name
-    assert "secret" not in name
-    assert "10.0.0.1/live" in name
+    assert CameraConfig("rtsp://user:secret@10.0.0.1/live").name == "rtsp://10.0.0.1/live"
 
 
 @pytest.mark.parametrize(

@@ -528,32 +528,6 @@ def test_firmware_turns_the_lights_off_when_the_host_is_killed(simulated):
 
 
 @pytest.mark.slow
-def test_firmware_executes_repeated_requests_once(simulated, monkeypatch):
-    with connect(simulated.path) as leds:
-        connection = leds._connection
-        write, next_line, damage = connection._write, connection._next_line, {"request": 2, "answer": 2}
-
-        def damaged_write(line):
-            damage["request"] -= 1
-            return write(line if damage["request"] < 0 else line.replace(b"SET", b"SAT"))
-
-        def damaged_line(until):
-            line = next_line(until)
-            if line is not None and b"SET" in line and damage["answer"] > 0:
-                damage["answer"] -= 1
-                return line.replace(b"SET", b"SAT")
-            return line
-
-        before = leds.ping()
-        monkeypatch.setattr(connection, "_write", damaged_write)
-        monkeypatch.setattr(connection, "_next_line", damaged_line)
-        lit = leds.set(ON)
-        assert damage == {"request": -3, "answer": 0}  # two damaged requests, and three for two damaged answers
-        assert (lit.levels, lit.counter) == (ON, before.counter + 1)
-        assert leds.ping().unchanged_since(lit)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("letter", ["r", "s"], ids=["reset", "clock stops"])
 def test_firmware_restarts_dark_with_another_boot_number(simulated, letter):
     with connect(simulated.path) as leds:

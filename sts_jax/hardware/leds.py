@@ -368,9 +368,8 @@ class Connection:
             self._heard = b""
             sent_s = time.monotonic()
             deadline = sent_s + timeout_s
-            accepted = False
             while (now := time.monotonic()) < deadline:
-                accepted |= self._write(line)
+                self._write(line)
                 until = min(deadline, now + REPEAT_S)
                 while (reply := self._next_reply(until)) is not None:
                     if isinstance(reply, protocol.Refused) and reply.sequence in (0, self._sequence):
@@ -383,10 +382,6 @@ class Connection:
                     if isinstance(reply, answer) and reply.sequence == self._sequence:
                         self.answered_s = time.monotonic()
                         return reply, sent_s, self.answered_s
-            if not accepted:
-                raise LedTimeoutError(
-                    f"the port {self.name} accepted no bytes for {timeout_s:g} s: replug the LED controller."
-                )
             raise LedTimeoutError(
                 f"the LED controller on {self.name} gave no valid answer to the request "
                 f"{line.decode().strip()!r} within {timeout_s:g} s. {self._description()}"
@@ -442,19 +437,15 @@ class Connection:
         except (OSError, TypeError) as error:  # TypeError: pyserial reads from a port that was closed meanwhile
             raise self._vanished(error) from error
 
-    def _write(self, line: bytes) -> bool:
-        """Write a line. Return False after a timeout.
-
-        pyserial also reports a timeout for a line that it has sent, if the operating system suspended the process in
-        between. This happens on a busy computer.
-        """
+    def _write(self, line: bytes) -> None:
+        # pyserial also reports a timeout for a line that it has sent, if the operating system suspended the process in
+        # between. This happens on a busy computer. A line that was not sent gets no answer.
         try:
             self._serial.write(line)
-        except serial.SerialTimeoutException:
-            return False
+        except serial.SerialTimeoutException as error:
+            _log.debug("%s: %s", self.name, error)
         except (OSError, TypeError) as error:
             raise self._vanished(error) from error
-        return True
 
     def _vanished(self, error: Exception) -> DisconnectedError:
         return DisconnectedError(
