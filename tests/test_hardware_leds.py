@@ -486,7 +486,7 @@ def simulated(built):
 @pytest.mark.slow
 def test_firmware_sets_the_duty_cycles(simulated):
     with connect(simulated.path) as leds:
-        assert leds.controller == protocol.Controller(mock.ANY, 1, "1.0.0", "atmega328p", "SIM-1", 4)
+        assert leds.controller == protocol.Controller(leds.controller.sequence, 1, "1.0.0", "atmega328p", "SIM-1", 4)
         for levels in (ON, (1, 2, 3, 4), (255,) * 4, protocol.DARK, (0, 0, 0, 255), (0, 7, 0, 0)):
             lit = leds.set(levels)
             simulated.wait_for(levels)
