@@ -117,10 +117,8 @@ def energy_distance(
 
     Args:
         real: Features of the real images, from `features`, `(n, k)`.
-        simulated: Features of the simulated images, `(m, k)`.
         real_group: Number of the trajectory of each real image, int `(n,)`.
         simulated_group: Number of the trajectory of each simulated image, int `(m,)`.
-        seed: Seed of the permutations.
 
     Source: Szekely and Rizzo (2013), Energy statistics: a class of statistics based on distances.
     """

@@ -18,9 +18,6 @@ def image_summary(
 
     Args:
         predictions: Predictions by name, with those of `image_baselines`.
-        test: The held-out trajectories.
-        num: Number of bootstrap samples.
-        seed: Seed of the bootstrap.
 
     Returns:
         A dictionary for each of the streams `visual` and `tactile`, with the following entries.

@@ -307,8 +307,6 @@ def bootstrap(
     Args:
         groups: Group of each item, such as its object, `(n,)`.
         statistic: Function of the weights of the items, `(n,)`. A weight is how often the item's group was drawn.
-        num: Number of bootstrap samples.
-        seed: Seed of the random numbers.
 
     Returns:
         Values of the statistic, `(num, ...)`.

@@ -167,11 +167,10 @@ def predict(
     two outcomes and `validation` and `blank` are given: `FELL_OFF` if the image shows no object.
 
     Args:
-        predictor: The model: a `sts_jax.Predictor`, or any object with its `__call__`, `prior` and `preprocessing`.
+        predictor: A `sts_jax.Predictor`, or any object with its `__call__`, `prior` and `preprocessing`.
+        test: The held-out trajectories, with images of the resolution that the model expects.
         inputs: Names of the inputs, some of `predictor.modalities`, or also `state` for models that accept the true
             pose, shape and mass. Without inputs, the prediction is the model's prior, which has no samples.
-        test: The held-out trajectories, with images of the resolution that the model expects.
-        scenario: The scenario of the trajectories.
         validation: Trajectories for choosing the threshold that separates images with and without an object.
         blank: Empty visual image in [0, 1], `(height, width, 3)`.
         num_samples: Number of samples of each prediction, or 0 for none.

@@ -54,11 +54,6 @@ def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str
 
     The first three also predict the measurements, with the mean of the measured values where a value was not measured.
 
-    Args:
-        scenario: The scenario of the trajectories.
-        train: The training trajectories.
-        test: The held-out trajectories.
-
     Returns:
         The predictions for `test` by name, one of `BASELINES`.
     """
@@ -160,14 +155,11 @@ def ceiling(
 
     Args:
         collection: The description of the dataset that contains the items.
-        sensor: The sensor that renders the last frames.
-        test: The items. The predicted images have the resolution of the items' images.
         times: Number of re-rolls per item, >= 1.
-        key: The random key of the re-rolls.
         progress: Function that is called with the number of re-rolls simulated so far, over all items.
 
     Returns:
-        A prediction with the re-rolls as samples (images in `uint8`). The images are the means of the samples' images,
+        A prediction with the re-rolls as samples (images in `uint8`, of the resolution of `test`). The images are the means of the samples' images,
         the pose is their central pose (`metrics.centre`), and the outcome probabilities are their `shares`.
     """
     if times < 1:

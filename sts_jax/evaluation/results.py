@@ -31,7 +31,6 @@ def score(
 
     Args:
         predicted: The prediction of all items, or of the first ones only.
-        test: The held-out items.
         outcomes: The outcomes of the scenario, `scenario.outcomes`, for predictions with `outcome_probability`.
         frequency: Frequency of each outcome among the training trajectories, `(c,)`, from `evaluation.frequency`. If it
             is None, the predicted outcome is `predicted.outcome`, or else the likeliest outcome.
@@ -108,11 +107,8 @@ def summarise(
     Args:
         scores: Scores by predictor, including those of `evaluation.baselines`. A predictor may have scores of the first
             items only. Its metrics are then computed from these items.
-        test: The held-out trajectories (items) that were scored.
         metrics: The metrics, the same as for `score`.
         outcomes: The outcomes of the scenario, `scenario.outcomes`, for their names.
-        num: Number of bootstrap samples.
-        seed: Seed of the bootstrap.
 
     Returns:
         A dictionary that can be written as JSON, with the following entries. Each metric is a dictionary of `value` and
@@ -207,10 +203,7 @@ def gain(
     Args:
         before: Scores of the first predictor, for instance from vision.
         after: Scores of the second predictor, for instance from vision and touch.
-        test: The held-out trajectories that were scored.
         metric: Name of a metric that is a mean of its errors. The default is the log loss of the outcome.
-        num: Number of bootstrap samples over objects.
-        seed: Seed of the bootstrap.
 
     Returns:
         A dictionary of `value` and of the limits `low` and `high` of its 95 % interval, or None if a predictor lacks
@@ -246,9 +239,7 @@ def table(
 
     Args:
         summary: The result of `summarise`.
-        title: Heading above the table.
         rows: Names of the predictors, in the order of the rows (default: all).
-        notes: Lines below the table.
         columns: The columns of metrics, from left to right.
     """
     lines = _head(["predictor", *(column.heading for column in columns)])
@@ -266,8 +257,6 @@ def full_table(summary: dict, *, title: str, notes: Sequence[str] = (), metrics:
 
     Args:
         summary: The result of `summarise`.
-        title: Heading above the tables.
-        notes: Lines below the tables.
         metrics: The metrics, in the order of the columns. Those whose field `column` is False are left out.
     """
     shown = [metric for metric in metrics if metric.column]

@@ -35,10 +35,8 @@ def scaling(path: Path, points: Sequence[Trained], *, ceiling: float | None = No
     the same name and number of trajectories.
 
     Args:
-        path: The PNG file to write.
         points: The trained models.
         ceiling: Skill of the best possible prediction, drawn as a horizontal line. None draws no line.
-        title: Title of the figure.
     """
     figure, axes = plt.subplots(1, 2, figsize=(10.5, 4.8), sharey=True)
     for axis, along, fixed, unit in (
@@ -87,7 +85,6 @@ def training_curves(path: Path, logs: Mapping[str, Sequence[Mapping[str, float]]
     """Draw the terms of the training loss over the gradient steps, with one panel per term and one line per model.
 
     Args:
-        path: The PNG file to write.
         logs: The training logs by the name of the model. A log has one dictionary for each logged gradient step, with
             the number of the step as `step`, and the terms.
     """
@@ -119,9 +116,7 @@ def calibration(path: Path, scores: Mapping[str, Scores], *, title: str) -> None
     """Draw how often the likeliest outcome is the true one, as a function of its predicted probability.
 
     Args:
-        path: The PNG file to write.
         scores: Scores by the name of the predictor. Those without outcome probabilities are not drawn.
-        title: Title of the figure.
     """
     judged = {name: own[CALIBRATION].T for name, own in scores.items() if CALIBRATION in own}
     width = 1 / metrics.BINS
@@ -168,13 +163,11 @@ def ends(
     """Draw the possible last positions of one trajectory beside the predicted ones, on the pad as the camera sees it.
 
     Args:
-        path: The PNG file to write.
         size: Size of the pad along x and y (m).
         start: First pose, `(7,)`.
         truth: True last pose, `(7,)`.
         rerolled: Last poses of m re-rolls, `(m, 7)`.
         sampled: k samples of the last pose from a model, `(k, 7)`.
-        title: Title of the figure.
     """
     figure, axes = plt.subplots(1, 2, figsize=(9, 5.4), sharex=True, sharey=True)
     half = 500 * np.asarray(size)  # mm

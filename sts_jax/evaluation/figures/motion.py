@@ -104,14 +104,9 @@ def strip(
     """Draw one trajectory over time: a view from outside, the visual and tactile images, and the wrench.
 
     Args:
-        path: The PNG file to write.
-        time: Times of the frames (s), `(frames,)`.
-        view: Images of `outside`, in [0, 1], `(frames, h, w, 3)`.
-        visual: Images of the visual stream, in [0, 1], `(frames, height, width, 3)`.
-        tactile: Images of the tactile stream, in [0, 1], `(frames, height, width, 3)`.
+        time: Times of the frames (s). The other arrays have a row for each frame, and images are in [0, 1].
+        view: Images of `outside`.
         wrench: Wrench in each frame (N, N m), `(frames, 6)`.
-        num: Number of frames whose images are drawn, denser at the beginning, and fewer for a short trajectory.
-        title: Title of the figure.
     """
     last = len(time) - 1
     chosen = np.unique(np.round(last * np.linspace(0, 1, num) ** 1.8).astype(int))
@@ -165,14 +160,10 @@ def animation(
     component of `gravity` along the pad. The animation runs at half the speed of the motion (`SLOWER` is 2).
 
     Args:
-        path: The GIF file to write.
-        time: Times of the frames (s), `(frames,)`.
-        view: Images of `outside`, in [0, 1], `(frames, h, w, 3)`.
-        visual: Images of the visual stream, in [0, 1], `(frames, height, width, 3)`.
-        tactile: Images of the tactile stream, in [0, 1], `(frames, height, width, 3)`.
-        wrench: Wrench in each frame (N, N m), `(frames, 6)`.
+        time: Times of the frames (s). The other arrays have a row for each frame, and images are in [0, 1].
+        view: Images of `outside`.
+        wrench: Wrench (N, N m), `(frames, 6)`.
         gravity: Gravity minus the acceleration of the pad in the sensor frame (m/s^2), `(frames, 3)`.
-        title: Title above the images.
         outcome: Text above the images in the last frame, such as `fell off`.
         side: Side of each of the three images (pixels).
     """

@@ -33,11 +33,7 @@ def predictions(
     arrow for 1 m/s is as long as a quarter of the image's width.
 
     Args:
-        path: The PNG file to write.
-        test: The held-out trajectories.
         predicted: Predictions for all trajectories of `test`, or for the first ones.
-        num: Maximum number of trajectories in the figure.
-        title: Title of the figure.
         scenario: The scenario, for the arrows and the names of the outcomes. None: no arrows, and the names of
             `physics.Outcome`.
     """
@@ -85,11 +81,8 @@ def comparison(
     """Draw images of n trajectories as a grid. Each trajectory is a row, and neighbouring columns form groups.
 
     Args:
-        path: The PNG file to write.
         groups: Images `(n, height, width, 3)` in [0, 1] by the title of their column, for each group from left to
             right.
-        labels: Labels of the n rows.
-        title: Title of the figure.
         heads: Titles of the groups.
     """
     rows, widths = len(labels), [len(group) for group in groups]
@@ -124,13 +117,8 @@ def side_by_side(
     A difference (real minus simulated, averaged over the colour channels) is red where the real image is brighter.
 
     Args:
-        path: The PNG file to write.
-        real: Real images, one for each row.
         simulated: Simulated images of the same shape.
-        labels: Labels of the rows.
         matched: True if the images of each row show the same object in the same pose.
-        title: Title of the figure.
-        names: Titles of the columns of real and simulated images.
     """
     rows, kinds = len(labels), 3 if matched else 2
     figure, grid = plt.subplots(
