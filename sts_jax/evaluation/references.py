@@ -159,8 +159,9 @@ def ceiling(
         progress: Function that is called with the number of re-rolls simulated so far, over all items.
 
     Returns:
-        A prediction with the re-rolls as samples (images in `uint8`, of the resolution of `test`). The images are the means of the samples' images,
-        the pose is their central pose (`metrics.centre`), and the outcome probabilities are their `shares`.
+        A prediction with the re-rolls as samples (images in `uint8`, of the resolution of `test`). The images are the
+        means of the samples' images, the pose is their central pose (`metrics.centre`), and the outcome probabilities
+        are their `shares`.
     """
     if times < 1:
         raise ValueError(f"times must be >= 1, got {times}")
