@@ -92,10 +92,7 @@ def simulated_dataset(folder: Path, resolution: tuple[int, int] | None) -> Side:
     """Read the first and the last frame of each rendered trajectory of a dataset."""
     data = dataset.load(folder)
     if data.collection["crop"]:
-        raise ValueError(
-            f"the images of {folder} are cropped to the object, but real images show the whole pad: collect the "
-            "dataset again with --collection.no-crop"
-        )
+        raise ValueError(f"{folder} has images cropped to the object: collect it again with --collection.no-crop")
     size = tuple(data.collection["resolution"])
     if resolution is not None and resolution != size:
         raise ValueError(
@@ -123,15 +120,9 @@ def load(config: Config) -> tuple[Side, Side]:
     """
     is_dataset = (config.simulated / "collection.json").exists()
     if is_dataset and config.match == "number":
-        raise ValueError(
-            f"{config.simulated} is a dataset, whose trajectory numbers do not correspond to the trajectory numbers of "
-            "the real images: give --match none"
-        )
+        raise ValueError(f"{config.simulated} is a dataset, whose numbers match no real ones: give --match none")
     if is_dataset and config.simulated_sensor is not None:
-        raise ValueError(
-            f"--simulated-sensor is {config.simulated_sensor}, but the images of the dataset {config.simulated} are "
-            "already rectified: leave out --simulated-sensor"
-        )
+        raise ValueError(f"{config.simulated} is a dataset, whose images are rectified: leave out --simulated-sensor")
     if config.resolution is not None and min(config.resolution) < gap.LEAST_SIDE:
         raise ValueError(
             f"--resolution must be at least {gap.LEAST_SIDE} x {gap.LEAST_SIDE} pixels, got {config.resolution}"
@@ -147,10 +138,7 @@ def load(config: Config) -> tuple[Side, Side]:
         return real, dataclasses.replace(simulated, images=others)
     common = np.intersect1d(real.images.group, simulated.images.group)
     if not len(common):
-        raise ValueError(
-            f"{config.real} and {config.simulated} have no trajectory number in common: give --match none if the "
-            "folders show the same object in different poses"
-        )
+        raise ValueError(f"{config.real} and {config.simulated} have no trajectory number in common: give --match none")
     return real.of(common), simulated.of(common)
 
 

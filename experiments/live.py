@@ -106,10 +106,7 @@ def check(config: Config) -> None:
         missing = "--camera" if config.camera is None else "--leds"
         raise ValueError(f"{missing} is missing: give both --camera and --leds, or a sensor file with --sensor")
     if config.sensor is not None and not hardware.sensor_file.sensor_file(config.sensor).exists():
-        raise ValueError(
-            f"--sensor is {config.sensor}, but there is no sensor file: give another path, or write the file with "
-            "`python -m experiments.commission`"
-        )
+        raise ValueError(f"--sensor is {config.sensor}, but there is no sensor file: run `experiments.commission`")
     if config.dwell < 1:
         raise ValueError(f"--dwell must be >= 1, got {config.dwell}")
     if config.seconds is not None and not config.seconds > 0:

@@ -41,10 +41,7 @@ def ship(workdir: Path, name: str) -> str:
         A line with the size of the copy, and the differences between predictions of the original and of the copy.
     """
     if not name.isidentifier():
-        raise ValueError(
-            f"the name of the model is {name!r}, but it must consist of letters, digits and underscores, and must not "
-            "begin with a digit: give another name, such as --name freefall"
-        )
+        raise ValueError(f"--name must be letters, digits and underscores, without a digit first, got {name!r}")
     original = sts.Predictor.load(workdir / "models" / "statespace")
     MODELS.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory(dir=MODELS, prefix=".") as temporary:
@@ -52,10 +49,7 @@ def ship(workdir: Path, name: str) -> str:
         original.save(new, compact=True)
         size = sum(path.stat().st_size for path in new.rglob("*") if path.is_file())
         if size > LIMIT:
-            raise ValueError(
-                f"the model of {workdir} has {size / 1e6:.1f} MB with rounded weights, but the limit is "
-                f"{LIMIT / 1e6:g} MB: train a smaller model"
-            )
+            raise ValueError(f"the model of {workdir} has {size / 1e6:.1f} MB, but the limit is {LIMIT / 1e6:g} MB")
         line = f"{name}: {size / 1e6:.1f} MB of at most {LIMIT / 1e6:g}; {compare(original, sts.Predictor.load(new))}"
         if (MODELS / name).exists():
             (MODELS / name).rename(old)

@@ -191,7 +191,7 @@ def test_an_interrupted_run_resumes_and_writes_a_file_that_opens_the_sensor(peer
         commissioning.claim_pictures(config, camera)
     with (
         hardware.Leds.connect(peer.path) as leds,
-        pytest.raises(ValueError, match=r"contains the sensor file of the camera .*give another"),
+        pytest.raises(ValueError, match=r"bench is for the camera .*give another --out"),
     ):
         commissioning.check_folder(config, camera, leds)
 

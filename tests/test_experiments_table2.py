@@ -68,7 +68,7 @@ def test_missing_trajectories_and_sensor_files_are_errors_with_a_remedy(tmp_path
     content = json.loads(plain.read_text())
     content["device"]["background_tactile"] = None
     plain.write_text(json.dumps(content))
-    with pytest.raises(ValueError, match="names no background images"):
+    with pytest.raises(ValueError, match="has no images of the empty pad"):
         table2.read(TINY, tmp_path / "few")
 
 

@@ -77,10 +77,7 @@ def check(config: Config) -> None:
             f"--ruler is {config.ruler:g} mm, but it must be 80 to 120 mm: measure the ruler on the printed page"
         )
     if config.board_images is not None and not config.board_images.is_dir():
-        raise FileNotFoundError(
-            f"--board-images is {config.board_images}, but this is not a folder: give a folder with pictures of the "
-            "board"
-        )
+        raise FileNotFoundError(f"--board-images is {config.board_images}, but this is not a folder of pictures")
     drawing.make_folder(config.out)
 
 
@@ -167,9 +164,8 @@ def wait(text: str, every: float | None) -> str:
         return input(f"{text} Then press Enter. ").strip().lower()
     except EOFError:
         raise ValueError(
-            "the Enter key cannot be read, because the standard input has ended: give --every SECONDS to wait for a "
-            "fixed time instead. To run without live pictures of the board, give --board-images FOLDER or --ideal-lens "
-            "DEGREES in addition to --every"
+            "the Enter key cannot be read: give --every SECONDS, and --board-images FOLDER or --ideal-lens DEGREES to "
+            "run without live pictures"
         ) from None
 
 
@@ -198,9 +194,8 @@ def check_folder(config: Config, camera: hardware.OpenCVCamera, leds: hardware.L
         return  # a missing or damaged file is written anew
     if (there.camera, there.leds) != (camera.source, leds.serial_number):
         raise ValueError(
-            f"{config.out} contains the sensor file of the camera {there.camera} and the LED controller {there.leds}, "
-            f"but the connected devices are {camera.source} and {leds.serial_number}: give another --out, or delete "
-            "this sensor file"
+            f"{config.out} is for the camera {there.camera} and the LED controller {there.leds}, but the connected "
+            f"devices are {camera.source} and {leds.serial_number}: give another --out"
         )
 
 
@@ -281,9 +276,8 @@ def calibrate(config: Config, sensor: hardware.STS, pinhole: sts.optics.Camera) 
         return pictures.fit(pinhole)
     except hardware.CalibrationError as error:
         raise hardware.CalibrationError(
-            f"{error} The pictures are kept in {folder}. If this message names bad pictures, delete them, and run the "
-            "command again to take new ones. To add pictures, run the command again with --pictures larger than "
-            f"{config.pictures}."
+            f"{error} The pictures are kept in {folder}. Delete bad ones, or raise --pictures above {config.pictures} "
+            "to add some, and run the command again."
         ) from error
 
 
@@ -309,7 +303,7 @@ class Pictures:
             if image.shape[1::-1] != size:
                 raise ValueError(
                     f"{path} has {image.shape[1]} x {image.shape[0]} pixels, but --width is {size[0]} and --height is "
-                    f"{size[1]}: set these options to the size of the pictures, or take the pictures again"
+                    f"{size[1]}: change these options, or take the picture again"
                 )
             pictures.corners[path.name] = hardware.find_board(image, board)
         return pictures

@@ -144,8 +144,8 @@ class Extensions:
             for metric in column.metrics:
                 if metric.name not in names:
                     raise ValueError(
-                        f"the column {column.heading!r} has the metric {metric.name!r}, which is not among the metrics "
-                        f"({', '.join(map(repr, names))}): add it to the field `metrics`, or leave out the column"
+                        f"the column {column.heading!r} has the metric {metric.name!r}, which is not among `metrics` "
+                        f"({', '.join(map(repr, names))}): add it, or leave out the column"
                     )
 
     @property
@@ -232,54 +232,41 @@ def check(config: Config, own: Extensions = NONE) -> None:
     collection.check(sts.Sensor())
     height, width = collection.resolution
     if height != width:
-        raise ValueError(
-            f"collection.resolution must be square, got {height} x {width}: give --collection.resolution {height} "
-            f"{height}"
-        )
+        raise ValueError(f"collection.resolution must be square, got {height} x {width}: give {height} {height}")
     if config.model == "statespace" and collection.crop:
         raise ValueError(
-            "collection.crop is True, but it must be False for the state-space model, which locates the object in the "
-            "whole image: give --collection.no-crop, or --model paper"
+            "collection.crop must be False for the state-space model: give --collection.no-crop, or --model paper"
         )
     allowed = image_sizes(config)
     if not allowed:
         raise ValueError(
-            f"collection.resolution must be a size that model {config.model!r} supports, got {height} x {width}: "
-            "give --collection.resolution 64 64 or 128 128"
+            f"model {config.model!r} supports no images of collection.resolution {height} x {width}: give 128 128"
         )
     if config.image_size not in allowed:
         listed, nearest = ", ".join(map(str, allowed)), min(allowed, key=lambda size: abs(size - config.image_size))
         raise ValueError(
             f"image_size must be one of {listed} for collection.resolution {height} {width} and model "
-            f"{config.model!r}, got {config.image_size}: give --image-size {nearest}, or choose "
-            "another --collection.resolution and an --image-size that divides it"
+            f"{config.model!r}, got {config.image_size}: give --image-size {nearest}, or another resolution"
         )
     if config.model == "paper" and config.steps is not None and len(config.steps) != len(names):
         raise ValueError(
-            f"steps must have one number for each model ({', '.join(names)}), got {config.steps}: change --steps, or "
-            "give --steps None to train each model for --training.epochs epochs"
+            f"steps must have one number for each model ({', '.join(names)}), or be None for --training.epochs, got "
+            f"{config.steps}: change --steps"
         )
     trained, option = config.schedule, "state_training" if config.model == "statespace" else "training"
     if trained.schedule == "cosine" and trained.steps is not None and trained.warmup >= trained.steps:
-        raise ValueError(
-            f"{option}.warmup must be smaller than {option}.steps ({trained.steps}), got {trained.warmup}: give "
-            f"--{option.replace('_', '-')}.warmup {trained.steps // 10}, for example"
-        )
+        raise ValueError(f"{option}.warmup must be smaller than {option}.steps ({trained.steps}), got {trained.warmup}")
     for name in ("num_shown", "num_samples", "rerolls", "num_rerolled"):
         if getattr(config, name) < 1:
             raise ValueError(f"{name} must be >= 1, got {getattr(config, name)}")
     if not config.splits or not set(config.splits) <= set(SPLITS):
-        raise ValueError(
-            f"splits must be one or more of {', '.join(SPLITS)}, got {config.splits}: give --splits "
-            f"{SPLITS[0]}, for example"
-        )
+        raise ValueError(f"splits must be one or more of {', '.join(SPLITS)}, got {config.splits}")
     for split in config.splits:
         _check_parts(collection, split)
     if own.measurements and config.model != "paper":
         raise ValueError(
             f"measurements must be empty for model={config.model!r}, got the modality {own.measurements[0].name!r}: "
-            "remove it, or use model='paper', because only the paper's model `mvae` accepts modalities in addition to "
-            "visual, tactile and pose"
+            "remove it, or use model='paper'"
         )
 
 

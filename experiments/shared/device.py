@@ -197,10 +197,7 @@ def _address(process: subprocess.Popen[str]) -> str:
             url = line.split()[1].removesuffix("/camera")
         if "Ctrl-C" in line:
             return url
-    raise RuntimeError(
-        "the digital twin did not start. Its error message is printed above. To reproduce it, run `python -m "
-        "experiments.twin`"
-    )
+    raise RuntimeError("the digital twin did not start, see above. To reproduce it, run `python -m experiments.twin`")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -294,9 +291,8 @@ def commissioned(config: Simulated, device: twin.Twin) -> tuple[twin.VirtualSens
     there.check_identity(camera=twin.CAMERA, leds=device.serial_number)
     if (there.width, there.height, there.levels) != (*config.size, config.levels):
         raise ValueError(
-            f"{file} is for images of {there.width} x {there.height} pixels and the LED levels {there.levels}, but the "
-            f"twin is set to {config.size[0]} x {config.size[1]} pixels and the levels {config.levels}: choose another "
-            "--workdir, or run `python -m experiments.real collect --twin` with the --size and --levels of the file"
+            f"{file} is for images of {there.width} x {there.height} pixels and LED levels {there.levels}, but --size "
+            f"is {config.size} and --levels is {config.levels}: change them, or choose another --workdir"
         )
     settling = hardware.Settling(there.settle_off_s, there.settle_on_s)
     sensor = twin.VirtualSensor(device, levels=config.levels, settling=settling)

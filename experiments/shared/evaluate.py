@@ -156,7 +156,7 @@ def _check_measurements(folder: Path, own: Extensions) -> None:
     if given != trained:
         raise ValueError(
             f"the names in measurements are {given}, but the model in {folder} was trained with {trained}: pass the "
-            "same Extensions(measurements=...) as for the training, or train the model again in a new work directory"
+            "same Extensions(measurements=...) as for the training"
         )
 
 

@@ -98,10 +98,7 @@ def lay(config: Config, sensor: sts.Sensor, body: sts.objects.Body) -> tuple[np.
     """
     shares = sts.physics.stable_faces(body, fill=FILL).share
     if not 0 <= config.rest < len(shares):
-        raise ValueError(
-            f"--rest is {config.rest}, but it must be the index of a face on which the object can rest, from 0 to "
-            f"{len(shares) - 1}"
-        )
+        raise ValueError(f"--rest is {config.rest}, but it must be the index of a face, from 0 to {len(shares) - 1}")
     rest = sts.physics.place(body, sensor, face=config.rest, fill=FILL)
     turn = Rotation.from_quat(np.asarray(rest.pose[3:], float), scalar_first=True)
     turn = Rotation.from_rotvec([*config.tilt, 0], degrees=True) * turn

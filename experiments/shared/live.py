@@ -122,15 +122,10 @@ class Live:
             show: Function that the thread calls after each prediction. The latency includes this call.
         """
         if "visual" not in predictor.modalities:
-            raise ValueError(
-                f"the model takes no visual images as inputs: give another --model. The model is {predictor!r}"
-            )
+            raise ValueError(f"--model must take visual images as inputs: give another one than {predictor!r}")
         width = predictor.model.config.condition
         if len(condition) not in (0, width):
-            raise ValueError(
-                f"the number of values of --condition must be {width}, got {len(condition)}: change this option, or "
-                f"leave it out. The model is {predictor!r}"
-            )
+            raise ValueError(f"--condition must have {width} values, got {len(condition)}, for {predictor!r}")
         self._predictor, self._views = predictor, views
         self._condition = np.asarray(condition or (0.0,) * width, np.float32) if width else None
         self._show = show

@@ -104,8 +104,8 @@ def check(config: Config) -> None:
         raise ValueError(f"held_out must be a share above 0 and below 1, got {config.held_out}")
     if config.shifts < 0 or not 0 <= config.largest_shift < config.image_size:
         raise ValueError(
-            f"shifts must be >= 0 and largest_shift must be 0 to {config.image_size - 1} pixels, got shifts = "
-            f"{config.shifts} and largest_shift = {config.largest_shift}"
+            f"shifts must be >= 0 and largest_shift 0 to {config.image_size - 1} pixels, got {config.shifts} and "
+            f"{config.largest_shift}"
         )
     if config.count < LEAST:
         raise ValueError(f"count must be >= {LEAST}, got {config.count}")
@@ -165,8 +165,7 @@ def sensor_file(workdir: Path) -> tuple[hardware.Device, sts.Sensor, tuple[np.nd
     path = workdir / "sensor.json"
     if not path.exists():
         raise FileNotFoundError(
-            f"the sensor file {path} is missing: copy all files of its folder, which `experiments.commission` writes, "
-            "into the work directory"
+            f"{path} is missing: copy all files that `experiments.commission` wrote into the work directory"
         )
     device = hardware.Device.load(path)
     backgrounds = device.backgrounds(path)
@@ -188,9 +187,8 @@ def jobs(config: Config, data: Recorded) -> Iterator[Job]:
         arrays, completed = training.image_arrays(visual, tactile, modalities, preprocessing, blank)
         if completed.absent:
             raise ValueError(
-                "none of the initial tactile images for training shows a contact: draw the newest images with "
-                "`python -m experiments.real review --sheet review.png`, and compare them with the tactile background "
-                "image that sensor.json names"
+                "none of the initial tactile images for training shows a contact: compare those of `python -m "
+                "experiments.real review --sheet review.png` with the tactile background of the sensor file"
             )
         schedule = config.training
         if config.steps is not None:
