@@ -150,7 +150,7 @@ def test_a_wrong_option_is_refused(options, message, tmp_path, monkeypatch, caps
         ({"image_size": 16, "model": "paper"}, r"image_size must be one of 32, 64, 128 .* model 'paper', got 16"),
         ({"collection": {"resolution": (96, 128)}}, r"must be square, got 96 x 128: give 96 96"),
         ({"collection": {"resolution": (8, 8)}}, r"supports no images of collection\.resolution 8 x 8: give"),
-        ({"collection": {"crop": True}}, r"collection\.crop must be False .*: give --collection\.no-crop, or --model paper"),
+        ({"collection": {"crop": True}}, r"crop must be False .*: give --collection\.no-crop, or --model paper"),
         ({"model": "paper", "steps": (5,)}, r"steps must have one number for each model \(mvae, .*, got \(5,\)"),
         (
             {"state_training": training.TrainConfig(steps=100, warmup=150, schedule="cosine")},

@@ -213,7 +213,7 @@ def test_the_page_shows_a_state_and_only_to_its_own_name():
     [
         ({"twin": True, "replay": ("a",)}, "--twin and --replay exclude each other"),
         ({"twin": True, "sensor": "a"}, "--twin and --sensor exclude each other"),
-        ({"sensor": "none"}, "--sensor is none, but there is no sensor file: give another path, or write"),
+        ({"sensor": "none"}, "--sensor is none, but there is no sensor file"),
         ({"replay": ("a", "b", "c")}, "--replay has 3 paths, but it takes one folder, or a visual and a tactile video"),
         ({"camera": "http://127.0.0.1/"}, "--leds is missing: give both --camera and --leds"),
         ({"seconds": 0.0}, "seconds must be > 0, got 0"),
