@@ -67,6 +67,21 @@ def test_a_block_above_the_friction_angle_slides_by_coulombs_law(friction, degre
     assert np.all(across < 0.01 * speed[:, 4])
 
 
+def test_a_ball_rolls_with_five_sevenths_of_the_pull():
+    radius, mass = 0.02, 0.1
+    constants = dataclasses.replace(SCENARIO.contact, rolling=0.0)
+    model = mujoco.MjModel.from_xml_string(scene._xml(PAD, 0.0, constants, [f'type="sphere" size="{radius}"'], "", ""))
+    data = mujoco.MjData(model)
+    scene.set_rigid(model, data, mass, np.zeros(3), 0.4 * mass * radius**2 * np.diag([1.01, 1, 0.99]), 0.8)
+    model.opt.gravity[:] = G * np.array([0, np.sin(SLOPE), -np.cos(SLOPE)])
+    data.qpos[:] = [0, -0.05, radius, 1, 0, 0, 0]
+    speeds = []
+    for _ in range(2):
+        mujoco.mj_step(model, data, nstep=2 * STEPS)
+        speeds.append(data.qvel[1])
+    np.testing.assert_allclose((speeds[1] - speeds[0]) / 0.1, 5 / 7 * G * np.sin(SLOPE), rtol=0.005)
+
+
 @pytest.fixture(scope="module")
 def bodies():
     return [objects.make(jax.random.key(i), name) for i, name in enumerate(["bottle", "fork", "camera", "scissors"])]
