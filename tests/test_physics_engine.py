@@ -214,9 +214,3 @@ def test_compound_bodies_land_on_their_parts():
     np.testing.assert_array_equal(traj.outcome, physics.Outcome.STANDS)
     lowest = left[:, 2].min() + np.asarray(traj.pose[:, -1, 2])
     np.testing.assert_allclose(lowest, 0, atol=5e-5)
-
-
-def test_progress_counts_trajectories():
-    done: list[int] = []
-    simulate(BODIES[0], scenario=physics.Freefall(), num=4, chunk=1, progress=done.append)
-    assert done == [1, 2, 3, 4]

@@ -107,36 +107,6 @@ def test_the_wrench_at_rest_carries_the_weight(bodies, drops):
         )
 
 
-def energy(bodies: list[objects.Body], drops: physics.Trajectory, row: int) -> np.ndarray:
-    """Kinetic and potential energy of one trajectory, frame by frame (J)."""
-    mass, com, inertia = rigid(bodies, drops, row)
-    matrix = np.empty((drops.pose.shape[1], 9))
-    for own, quat in zip(matrix, drops.pose[row, :, 3:].astype(np.float64), strict=True):
-        mujoco.mju_quat2Mat(own, quat)
-    matrix = matrix.reshape(-1, 3, 3)
-    linear, turn = drops.velocity[row, :, :3], drops.velocity[row, :, 3:]
-    v = linear + np.cross(turn, matrix @ com)
-    w = np.einsum("fji,fj->fi", matrix, turn)
-    kinetic = 0.5 * mass * np.sum(v**2, 1) + 0.5 * np.einsum("fi,ij,fj->f", w, inertia, w)
-    return kinetic + mass * G * (drops.pose[row, :, 2] + (matrix @ com)[:, 2])
-
-
-@pytest.mark.slow
-def test_energy_out_of_contact_never_exceeds_the_initial_energy(bodies, engine):
-    every_step = dataclasses.replace(SCENARIO, rate=1000.0, frames=400)
-    drops = jax.tree.map(
-        np.asarray,
-        physics.simulate(jax.random.key(3), bodies, Sensor(), every_step, NUM, chunk=4 * NUM, engine=engine),
-    )
-    flights = 0
-    for row in range(4 * NUM):
-        free = ~drops.contact[row] & (drops.pose[row, :, 2] > 0)
-        total = energy(bodies, drops, row)
-        assert np.all(total[free] <= total[0] * 1.005)
-        flights += np.sum(np.diff(free.astype(int)) == 1)
-    assert flights >= 4 * NUM  # most of them part from the pad more than once
-
-
 def test_states_equal_those_of_c_mujoco_until_shortly_after_the_first_touch(bodies, drops, engine):
     steps = round(1 / SCENARIO.rate / SCENARIO.contact.timestep)
     before, after = [], []

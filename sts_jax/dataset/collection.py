@@ -113,15 +113,6 @@ def make_bodies(collection: Collection, indices: np.ndarray) -> list[objects.Bod
     return [objects.decompose(body) if objects.gaps(body)[1] > objects.HOLLOW else body for body in bodies]
 
 
-def head(collection: Collection, count: int) -> Collection:
-    """Return a copy of the collection with only the first `count` objects."""
-    meshes = collection.meshes
-    if meshes is None:
-        return dataclasses.replace(collection, num_objects=count)
-    few = dataclasses.replace(meshes, names=meshes.names[:count], labels=meshes.labels[:count])
-    return dataclasses.replace(collection, meshes=few, num_objects=len(few.names))
-
-
 def split_objects(collection: Collection) -> dict[str, np.ndarray]:
     """Split the objects of a collection at random into parts with nearly equal proportions of the classes.
 
