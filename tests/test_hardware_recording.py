@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 from recording_writer import PERIOD_S, shot, write
 from session_writer import ORIGIN, SIZE
-from test_experiments_real import sensor_file
 
-from benchmarks.instruments.peers import SensorPeer
+import sts_jax as sts
 from sts_jax import hardware
 from sts_jax.storage import DamagedFileError
 
@@ -269,26 +268,16 @@ def test_bad_input_is_named(folder, tmp_path):
             hardware.Replay(folder, speed=speed)
 
 
-def test_a_recorded_sensor_replays_with_its_sensor_file(tmp_path):
-    """Against a sensor's devices: the light of each replayed image is the one in the log of the camera."""
-    peer = SensorPeer(tmp_path / "leds")
-    try:
-        file = sensor_file(peer, tmp_path / "sensor.json")
-        with (
-            hardware.STS.from_file(file, leds=peer.path) as sensor,
-            hardware.Recorder(tmp_path / "made", hardware.Origin.of(sensor), file=file) as recorder,
-        ):
-            for one, _ in zip(sensor.stream(0.5), range(10), strict=False):
-                recorder.add(one)
-            assert hardware.Replay(tmp_path / "made").device is not None  # before the recording ends
-        replay = hardware.Replay(tmp_path / "made", speed=None)
-        assert replay.device == hardware.Device.load(file)
-        assert replay.device.backgrounds(tmp_path / "made")[1].mean() == pytest.approx(210)
-        with replay:
-            found = list(replay.stream())
-        assert len(found) == 10
-        for one in found:
-            assert peer.judged(one.image, lit=one.stream == "tactile")
-            assert one.before.acknowledged_s < one.time_s < one.until_s
-    finally:
-        peer.stop()
+def test_a_recording_has_a_copy_of_the_sensor_file(tmp_path):
+    lens = hardware.Lens.ideal(*SIZE[::-1])
+    device = hardware.Device("camera", 30.0, "0123", lens, 0.1, 0.1, (255,) * 4, "2026-05-31", lens_from="ideal")
+    device.save(tmp_path / "bench", sts.Sensor(), (np.zeros((*SIZE, 3), np.uint8), np.full((*SIZE, 3), 9, np.uint8)))
+    with hardware.Recorder(tmp_path / "made", ORIGIN, file=tmp_path / "bench") as recorder:
+        recorder.add(shot(0))
+        recorder.add(shot(2))
+        assert hardware.Replay(tmp_path / "made").device == device  # before the recording ends
+    assert len(played(tmp_path / "made")) == 2
+    assert hardware.Replay(tmp_path / "made").device.backgrounds(tmp_path / "made")[1].mean() == 9
+    (tmp_path / "made/background_tactile.png").write_bytes(b"")
+    with pytest.raises(DamagedFileError, match=r"background_tactile\.png"):
+        hardware.Replay(tmp_path / "made")
