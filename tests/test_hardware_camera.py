@@ -91,6 +91,7 @@ def next_frame(camera):
 
 def test_read_never_returns_a_frame_that_was_served_before_the_call(server):
     with connected(server) as camera:
+        assert not camera.async_read().delayed
         for pause in (0.0, 0.01, 0.1, 0.003) * 5:
             time.sleep(pause)
             called = time.monotonic()
@@ -333,8 +334,9 @@ def test_a_camera_connects_again_after_disconnect(server):
         camera.disconnect()
         camera.disconnect()
         assert not camera.is_connected
-        with pytest.raises(CameraError, match=r"call connect\(\)"):
-            camera.read()
+        for call in (camera.read, camera.async_read, camera.read_latest):
+            with pytest.raises(CameraError, match=r"call connect\(\)"):
+                call()
 
 
 @pytest.mark.slow

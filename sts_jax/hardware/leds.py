@@ -192,7 +192,7 @@ class Leds:
         return lit
 
     def ping(self) -> Lit:
-        """Ask the controller for the present levels. The errors are those of `set`."""
+        """Ask the controller for the present levels."""
         return self._state(protocol.Ping)
 
     def close(self) -> None:
@@ -359,8 +359,7 @@ class Connection:
             timeout_s: Longest wait for the answer, including all repetitions (s).
 
         Returns:
-            The answer, the time just before the request was first sent, and the time just after the answer arrived,
-            both in seconds on the clock `time.monotonic`.
+            The answer, the time before the request was first sent, and the time of the answer (`time.monotonic`, s).
         """
         with self._lock:
             self._sequence = self._sequence % protocol.LAST_SEQUENCE + 1

@@ -226,7 +226,7 @@ class OpenCVCamera:
         deadline = time.monotonic() + limit_s
         epoch, lost_before = self._epoch, self._is_lost()
         while True:
-            while self._queue:
+            while self._queue and not self._stop.is_set():
                 if wanted(frame := self._queue.popleft()):
                     return frame
             remaining = deadline - time.monotonic()
@@ -314,7 +314,8 @@ class OpenCVCamera:
                     self._refused += lock(capture.device, self._held)[1].values()
                 if self._epoch < 0:
                     self._pace = Pace(config.fps or capture.rate)
-                self._pace.interrupted()
+                else:
+                    self._pace.interrupted()
                 self._epoch += 1
             return capture
         return None

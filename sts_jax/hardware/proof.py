@@ -171,17 +171,7 @@ class ProvenFrames:
         timeout_s: float,
         reconnect_s: float,
     ):
-        """Use open devices. Call `measure_settling` or `see_both` before the first image is taken.
-
-        Args:
-            camera: The connected camera.
-            leds: The open LED controller.
-            levels: Duty cycles of the four channels in the tactile stream, 0 to 255.
-            exposures: Exposures of the visual and of the tactile stream, in the unit of the camera's driver. If they
-                are equal or None, the camera's exposure is not changed.
-            timeout_s: Longest wait for a frame while the settling times are measured or a switch is repeated (s).
-            reconnect_s: Longest search for a controller that was lost (s).
-        """
+        """Use open devices, see `STS`. Call `measure_settling` or `see_both` before the first image is taken."""
         self._camera, self._leds = camera, leds
         self._levels, self._exposures = levels, exposures
         self._timeout_s, self._reconnect_s = timeout_s, reconnect_s
@@ -199,12 +189,7 @@ class ProvenFrames:
         self.discarded = 0  # frames that `shot` did not return
 
     def measure_settling(self, switches: int, watch_s: float) -> Settling:
-        """Measure the settling times, and use them from now on.
-
-        Args:
-            switches: Number of switches of the lights in each direction, off to on and on to off.
-            watch_s: Time for which frames are collected after the first switch in each direction (s).
-        """
+        """See `STS.measure_settling`."""
         for _ in range(_ATTEMPTS):
             if (measured := self._measured(switches, watch_s)) is not None:
                 return measured
@@ -270,8 +255,6 @@ class ProvenFrames:
 
     def shot(self, stream: Stream, deadline: float, *, after_s: float = 0.0, then: Stream | None = None) -> Shot:
         """Take an image of one stream.
-
-        After the frame has arrived, the controller must confirm that the lights have not changed since they were set.
 
         Args:
             stream: Stream of the image.
