@@ -47,7 +47,6 @@ class Predictor:
         """Create a predictor from its parts. `Predictor.load` is the usual way.
 
         Args:
-            model: Trained model.
             preprocessing: Preprocessing with which the model was trained.
             blank: Visual and tactile image of the empty sensor, each uint8 (height, width, 3).
             name: Name or folder of the model, for error messages.
@@ -307,7 +306,7 @@ class Predictor:
             )
         if condition is None:
             return None, None
-        condition = _float32(condition)
+        condition = _float32(_array(condition))
         limit = _LARGEST_CONDITION * np.array(self.preprocessing.condition_scale)
         fine = (abs(condition) <= limit).all(axis=-1)
         if _traced(fine):
@@ -326,7 +325,8 @@ def _traced(value: object) -> bool:
 
 
 def _array(value: Any) -> np.ndarray | Array:
-    return value if isinstance(value, jax.Array) else np.asarray(value)
+    """Convert a value to NumPy, because inside `jax.jit` a test of a JAX array would be traced."""
+    return value if _traced(value) else np.asarray(value)
 
 
 def _float32(array: Any) -> Any:

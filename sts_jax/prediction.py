@@ -60,8 +60,6 @@ def predict(
     """Predict with a multimodal variational autoencoder: decode the mean of the posterior, given the inputs.
 
     Args:
-        graphdef: Definition of the model.
-        state: Parameters and running batch statistics of the model.
         preprocessing: Preprocessing with which the model was trained.
         blank: Tactile image of the empty sensor in [0, 1].
         inputs: Inputs by name: images in [0, 1], poses (*n, 7), vectors in SI units. Any may be missing.
@@ -127,8 +125,6 @@ def predict_samples(
     with the smallest mean distance (in position and angle) from the other samples.
 
     Args:
-        graphdef: Definition of the model.
-        state: Parameters of the model.
         preprocessing: Preprocessing with which the model was trained.
         empty: Images "visual" and "tactile" of the empty sensor in [0, 1].
         inputs: All inputs of the model by name, see `completed`, and optionally the state codes "state".

@@ -35,7 +35,6 @@ def write_whole(path: Path, write: Callable[[Path], None]) -> None:
     Missing folders are created. An OSError names the file and the remedy. Other errors of `write` are raised unchanged.
 
     Args:
-        path: The file.
         write: Function that writes the content to the path of a temporary file, which is then renamed to `path`.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
@@ -90,7 +89,6 @@ def read_json(path: Path, remedy: str) -> Any:
     """Read a JSON file.
 
     Args:
-        path: The file.
         remedy: Text at the end of the error message, with the remedy for a damaged file.
     """
     try:
@@ -148,7 +146,6 @@ def read_arrays(path: Path, remedy: str) -> dict[str, np.ndarray]:
     """Read the arrays of a file that `write_arrays` wrote.
 
     Args:
-        path: The file.
         remedy: Text at the end of the error message, with the remedy for a damaged file.
     """
     data = path.read_bytes()
@@ -223,7 +220,6 @@ def write_manifest(folder: Path, files: Mapping[str, str], facts: Mapping[str, A
     """Write `manifest.json`, after all other files of the folder. The file also has a checksum of its own content.
 
     Args:
-        folder: The folder.
         files: SHA-256 by relative path, from `checksums`. For files that have not changed, pass the values of the
             previous manifest, so that damage since then is not hidden.
         facts: Further JSON values.
@@ -237,7 +233,6 @@ def read_manifest(folder: Path, remedy: str) -> Manifest | None:
     """Read `manifest.json`, without comparing the files. None if the folder has no such file.
 
     Args:
-        folder: The folder.
         remedy: Text at the end of the error message, with the remedy for a damaged or edited manifest.
     """
     path = folder / MANIFEST
@@ -254,8 +249,6 @@ def verify(folder: Path, manifest: Manifest, remedy: str, names: Iterable[str] |
     """Compare files of a folder with their checksums in its manifest. The first that differs is named.
 
     Args:
-        folder: The folder.
-        manifest: Its manifest.
         remedy: Text at the end of the error message.
         names: Relative paths of the files to compare. None: all files of the manifest.
     """

@@ -1,4 +1,4 @@
-"""The smallest state-space models, which compile in seconds, and random inputs for them."""
+"""The smallest state-space models, which compile in seconds, random inputs for them, and a kill of a training."""
 
 import dataclasses
 
@@ -54,3 +54,22 @@ def state_model(**changes):
     model = training.Model(STATE, graphdef, params, 0, settings)
     grey = np.full((size, size, 3), 178, np.uint8)
     return sts.Predictor(model, training.Preprocessing(**view), (grey, grey), "new")
+
+
+class Killed(BaseException):
+    """Not caught by `except Exception`, like the end of a process."""
+
+
+def kill_at(step):
+    """A `progress` that kills a training at a step."""
+
+    def progress(done, total, record):
+        if done == step:
+            raise Killed
+
+    return progress
+
+
+def same(a, b):
+    """Assert that two trees have the same bits."""
+    jax.tree.map(np.testing.assert_array_equal, a, b)

@@ -99,7 +99,7 @@ def test_a_model_takes_a_jerk_in_si_units(workdir):
     out = predictor(tactile=pairs.tactile[:, 0] / 255, condition=pairs.condition)
     other = predictor(tactile=pairs.tactile[:, 0] / 255, condition=pairs.condition * [-1, -1, 1])
     assert np.abs(out.pose - other.pose).max() > 1e-4
-    with pytest.raises(ValueError, match=r"condition is missing, but .* needs a condition of shape \(1, 3\)"):
+    with pytest.raises(ValueError, match=r"condition has shape None, but .* needs \(1, 3\)"):
         predictor(tactile=pairs.tactile[:, 0] / 255)
 
 

@@ -10,6 +10,7 @@ import optax
 import pytest
 from extending_page import blocks
 from flax import nnx
+from statespace_config import Killed, kill_at, same
 from tensorboardX.proto import event_pb2
 
 from sts_jax import mvae, training
@@ -22,22 +23,6 @@ def arrays(samples=20):
     rng = np.random.default_rng(0)
     data = {"pose": rng.random((samples, 3), np.float32), "sound": rng.random((samples, 2), np.float32)}
     return training.Arrays(data, data)
-
-
-class Killed(Exception):
-    pass
-
-
-def kill_at(step):
-    def progress(done, total, record):
-        if done == step:
-            raise Killed
-
-    return progress
-
-
-def same(a, b):
-    jax.tree.map(np.testing.assert_array_equal, a, b)
 
 
 def half_square(graphdef, params, stats, key, batch, beta):
@@ -172,26 +157,3 @@ def test_the_code_of_the_page_trains_with_a_penalty_and_another_optimiser_and_wr
     assert "penalty" not in logged[0]
     wanted = {(name, record["step"]) for record in logged for name in record if name != "step"}
     assert scalars(tmp_path / "tensorboard" / "logged") == wanted
-
-
-@pytest.mark.slow
-def test_a_further_modality_trains_loads_and_predicts_without_a_change_of_the_library(tmp_path):
-    """The pose follows from the sound alone: the error is far below that of the mean pose."""
-    rng = np.random.default_rng(0)
-    sound = rng.uniform(-1, 1, (400, 2)).astype(np.float32)
-    pose = np.stack([sound[:, 0], sound[:, 1], sound[:, 0] - sound[:, 1]], axis=1)
-    pose_start = np.zeros_like(pose)
-    modalities = (
-        mvae.Modality("pose", "vector", (3,), weight=100.0),
-        mvae.Modality("sound", "vector", (2,), weight=100.0),
-    )
-    model = mvae.Config(modalities, latent=8, hidden=32)
-    data = training.Arrays({"pose": pose_start[:300], "sound": sound[:300]}, {"pose": pose[:300], "sound": sound[:300]})
-    config = training.TrainConfig(
-        steps=600, batch_size=50, learning_rate=1e-2, encoder_epsilon=1e-3, log_every=100, checkpoint_every=600
-    )
-    training.train(config, model, data, workdir=tmp_path)
-    trained = training.load(tmp_path)
-    predicted, _ = mvae.predict(trained.graphdef, trained.state, {"sound": jnp.asarray(sound[300:])})
-    error = np.mean((np.asarray(predicted["pose"]) - pose[300:]) ** 2)
-    assert error < 0.1 * np.mean((pose[300:] - pose[:300].mean(0)) ** 2)

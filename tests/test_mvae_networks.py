@@ -86,15 +86,6 @@ def test_batch_norm_weighs_samples():
     np.testing.assert_allclose(y, (x - 0.1 * mean) / np.sqrt(0.9 + 0.1 * var + 1e-5), atol=1e-4)
 
 
-def test_batch_norm_without_a_present_sample_changes_nothing():
-    norm = mvae.BatchNorm(3, momentum=0.9)
-    x = jnp.ones((2, 4, 4, 3)) * 5
-
-    assert np.isfinite(norm(x, jnp.zeros(2))).all()
-    np.testing.assert_array_equal(norm.mean[...], 0)
-    np.testing.assert_array_equal(norm.var[...], 1)
-
-
 @pytest.mark.slow
 def test_an_untrained_model_uses_a_few_quiet_latents_and_leaves_the_others_at_the_prior():
     graphdef, params, stats = mvae.init(jax.random.key(1), PAPER)

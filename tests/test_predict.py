@@ -90,16 +90,6 @@ def test_any_subset_and_any_leading_axes(predictor, names, lead):
         np.testing.assert_allclose(alone.visual, out.visual[(0,) * len(lead)], atol=1e-5)
 
 
-def test_fusion_is_the_product_of_the_single_posteriors(predictor):
-    given = measurement()
-    parts = [predictor(**{name: value}) for name, value in given.items()]
-    precision = 1 + sum(np.exp(-part.log_var) - 1 for part in parts)
-    mean = sum(part.mean * np.exp(-part.log_var) for part in parts) / precision
-    fused = predictor(**given)
-    np.testing.assert_allclose(fused.log_var, -np.log(precision), atol=1e-4)
-    np.testing.assert_allclose(fused.mean, mean, atol=1e-4)
-
-
 def test_masked_and_untouched_items_fall_back_on_the_rest(predictor):
     given = measurement(3)
     given["visual"][1] = np.nan
@@ -169,6 +159,9 @@ def test_each_invalid_input_is_named(predictor, given, error, message, jit):
 
 
 def test_shapes_types_and_constants_are_checked_inside_jit(predictor):
+    bright = jnp.asarray(GIVEN["visual"] * 255)
+    with pytest.raises(ValueError, match="divide by 255"):
+        jax.jit(lambda: predictor(visual=bright))()
     for wrong, error, message in (
         ({"visual": GIVEN["visual"][:, 1:]}, ValueError, "visual has shape"),
         ({"visual": jnp.zeros((2, SIDE, SIDE, 3), jnp.uint8)}, ValueError, "visual is uint8"),
@@ -255,18 +248,6 @@ def test_a_saved_predictor_is_loaded_unchanged(predictor, tmp_path):
         predictor.save(tmp_path / "copy")
     train(tmp_path / "copy")  # A finished training is only read, for which the optimiser's state is not needed.
     assert [path.name for path in (tmp_path / "copy/checkpoints/00000002").iterdir() if path.is_dir()] == ["weights"]
-
-
-def test_reprs_fit_on_one_line(predictor, folder):
-    assert repr(predictor) == (
-        f"Predictor('{folder}': takes visual, tactile, pose; predicts visual, tactile, pose; resolution=(32, 32), "
-        "crop=False, condition=0, steps=2)"
-    )
-    out = predictor(pose=measurement(2)["pose"])
-    assert repr(out._replace(visual=None)) == (
-        "Prediction(visual=None, tactile=float32[2, 32, 32, 3], pose=float32[2, 7], mean=float32[2, 8], "
-        "log_var=float32[2, 8], samples=None, outcome_probability=None)"
-    )
 
 
 def close(a, b, atol=1e-5):

@@ -5,10 +5,10 @@ import json
 import resource
 import shutil
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from statespace_config import Killed, kill_at, same
 
 from sts_jax import mvae, storage, training
 from sts_jax.training import folder as model_folder
@@ -46,10 +46,6 @@ def state():
     return training.initial(CONFIG, training.learner(SMALL), 4)[1]
 
 
-def same(a, b):
-    jax.tree.map(np.testing.assert_array_equal, a, b)
-
-
 def listed(folder):
     return sorted(model_folder.manifest(folder).files)
 
@@ -59,10 +55,6 @@ def sign(folder):
     manifest = model_folder.manifest(folder)
     files = [name for name in manifest.files if (folder / name).exists()]
     storage.write_manifest(folder, storage.checksums(folder, files), manifest.facts)
-
-
-class Killed(BaseException):
-    """Not caught by `except Exception`, like the end of a process."""
 
 
 def read_all(folder):
@@ -239,13 +231,9 @@ def test_a_config_of_another_version_is_named(folder, change):
 
 
 def test_a_model_is_loaded_without_any_optimiser(folder, finished, tmp_path, monkeypatch):
-    def stop(done, total, record):
-        if done == 2:
-            raise Killed
-
     begun = tmp_path / "begun"
     with pytest.raises(Killed):
-        train(begun, progress=stop)
+        train(begun, progress=kill_at(2))
     for path in (folder, begun):
         shutil.rmtree(next(path.glob("checkpoints/*/optimiser")))
         sign(path)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from statespace_config import TINY, random_codes, random_states
+from statespace_config import TINY, Killed, kill_at, random_codes, random_states, same
 
 from sts_jax import mvae, objects, statespace, training
 
@@ -22,26 +22,10 @@ def arrays(samples=20, seed=0):
     return training.Arrays(data, data, {"b": rng.random(samples) < 0.5})
 
 
-class Killed(Exception):
-    pass
-
-
-def kill_at(step):
-    def progress(done, total, record):
-        if done == step:
-            raise Killed
-
-    return progress
-
-
 def files(folder):
     """Time of change and content of everything in a folder."""
     paths = [folder, *sorted(folder.rglob("*"))]
     return {str(p): (p.stat().st_mtime_ns, p.read_bytes() if p.is_file() else None) for p in paths}
-
-
-def same(a, b):
-    jax.tree.map(np.testing.assert_array_equal, a, b)
 
 
 @pytest.fixture(scope="module")

@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
 
-import sts_jax as sts
-from sts_jax import geometry, hardware, training
+from sts_jax import geometry, training
 from sts_jax.evaluation.metrics import geodesic_angle
-from sts_jax.hardware import guide, twin
 
 
 def poses(count):
@@ -108,53 +106,3 @@ def test_images_of_another_resolution_and_invalid_fields_are_refused():
         training.Preprocessing(touch_block=3)
     with pytest.raises(ValueError, match="resolution is missing"):
         training.Preprocessing.from_json({})
-
-
-@pytest.mark.slow
-def test_both_criteria_find_light_contacts_of_a_noisy_twin_and_nothing_on_its_empty_pad():
-    size = (240, 320)
-    sensor, body = sts.Sensor(), sts.objects.make(jax.random.key(0), "camera")
-    gentle = sts.physics.Released(carried=(0.05, 0.1))  # the pad carries 5 to 10 % of the weight
-    scene = twin.ObjectScene(body, sensor=sensor, scenario=gentle, resolution=size, motion_rate=0.2)
-    lens = hardware.Lens.ideal(size[1], size[0])
-    noisy = twin.Imperfections(full_well=800, read_noise=0.005)  # three times the noise of the default
-    warp = twin.lens_warp(lens, sensor.camera, size)
-    with twin.Twin(scene, imperfections=noisy, warp=warp) as device:
-
-        def raw():
-            device.set((255,) * 4)
-            device.step(0.2)
-            return device.capture()[1]
-
-        background = [raw() for _ in range(20)]
-        free = [raw() for _ in range(100)]
-        pressed = []
-        for _ in range(24):
-            device.command("hold")
-            device.step(0.2)
-            pressed.append(raw())
-            assert device.state.phase == "held"
-    known, empty, held = (
-        np.stack([hardware.rectified(lens, sensor.camera, image, (64, 64)) for image in images])
-        for images in (background, free, pressed)
-    )
-    blank = np.round(known.mean(0)).astype(np.uint8)
-    own = training.touch_of_noisy_images(training.Preprocessing(), held, blank)
-    before = touched(training.Preprocessing(), empty, blank).mean()
-    false, true = touched(own, empty, blank).mean(), touched(own, held, blank).mean()
-    print(
-        f"threshold {255 * own.touch_threshold:.1f} of 255; empty pad: {false:.2f} of 100 images are touches "
-        f"({before:.2f} by the criterion of simulated images); light contacts: {true:.2f} of {len(held)}"
-    )
-    assert before > 0.5
-    assert false <= 0.01
-    assert true >= 0.95
-    # The guide tests raw images. The visual image has no influence on its test.
-    observed = [[guide.observe(0.0, image, image) for image in images] for images in (background[:4], free, pressed)]
-    pad = guide.empty_pad(observed[0])
-    false, true = (
-        np.mean([guide.has_contact(guide.GuideConfig(), pad, seen) for seen in group]) for group in observed[1:]
-    )
-    print(f"guide: {false:.2f} of the images of the empty pad, {true:.2f} of the light contacts")
-    assert false <= 0.01
-    assert true >= 0.95

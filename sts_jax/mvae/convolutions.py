@@ -29,8 +29,6 @@ def conv(
     the images count as 0. The output has `(h + 2 padding - size) // stride + 1` rows, and columns likewise.
 
     Args:
-        x: Images.
-        kernel: Weights.
         stride: Step of the kernel from one output pixel to the next, in input pixels.
         padding: Number of zeros before the first and after the last pixel of each axis, at most `size - 1`.
     """
@@ -50,8 +48,6 @@ def conv_transpose(
     `stride (h - 1) + size - 2 padding` rows, and columns likewise.
 
     Args:
-        x: Images.
-        kernel: Weights.
         stride: Step of the kernel from one input pixel to the next, in output pixels.
         padding: Number of rows and columns that are cut from each side of the output.
     """

@@ -82,9 +82,6 @@ def loss(
     use the same modalities of a sample also use the same noise for its `z`.
 
     Args:
-        graphdef: Definition of the model, from `init`.
-        params: Parameters of the model.
-        stats: Running batch statistics of the model.
         key: Random key for the noise of `z`.
         inputs: Inputs by modality, `(batch, *shape)`. Images are in [0, 1]. A modality without an input counts as
             absent.
@@ -146,7 +143,6 @@ def infer(
     """Compute the posterior `q(z | X)`, with the running batch statistics. Without any input, it is the prior.
 
     Args:
-        graphdef: Definition of the model, from `init`.
         state: Parameters and running batch statistics, `nnx.merge_state(params, stats)`.
         inputs: Inputs by modality, at least one, `(batch, *shape)`. Images are in [0, 1].
         present: Masks of the inputs by modality. An input without a mask is present in all samples.
@@ -173,9 +169,7 @@ def decode(
     """Predict every modality from a latent, with the running batch statistics.
 
     Args:
-        graphdef: Definition of the model, from `init`.
         state: Parameters and running batch statistics, `nnx.merge_state(params, stats)`.
-        z: Latents.
         condition: Numbers that are appended to each latent.
 
     Returns:

@@ -242,7 +242,6 @@ class MVAE(nnx.Module):
         """The expert of one modality.
 
         Args:
-            name: Name of the modality.
             x: Images in [0, 1] or vectors, `(batch, *shape)`.
             weights: Weight of each sample in batch normalisation. None uses the running statistics.
 
@@ -255,7 +254,6 @@ class MVAE(nnx.Module):
         """Predict one modality from latents, to which the condition is appended.
 
         Args:
-            name: Name of the modality.
             z: Latents, `(batch, latent + condition)`.
             weights: Weight of each sample in batch normalisation. None uses the running statistics.
 

@@ -59,8 +59,6 @@ def fit(
     """Fit the calibration of a model, by maximum likelihood with a prior that favours values near 1.
 
     Args:
-        graphdef: Definition of the model, from `init`.
-        params: Parameters of the model.
         inputs: All inputs of the model by name: images `visual` and `tactile` `(n, size, size, 3)`, uint8 or in [0, 1],
             and pose codes `pose` `(n, 12)`.
         targets: `state` has the state codes of the first frames, `pose` the pose codes of the last frames, `outcome`

@@ -394,7 +394,6 @@ def experts(
     """The expert of each input alone, `(n, code + look)`, by name of the input.
 
     Args:
-        model: The networks.
         inputs: Images `visual` and `tactile` `(n, size, size, 3)` in [0, 1], pose codes `pose` `(n, 12)` and, if they
             are known, state codes `state` `(n, code)`.
         counts: A mask for each name in `inputs`. Values of items whose mask is False have no influence and may be NaN.

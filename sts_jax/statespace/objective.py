@@ -130,8 +130,6 @@ def loss(
     """Compute the loss of one batch, see the docstring of the module.
 
     Args:
-        graphdef: Definition of the model, from `init`.
-        params: Parameters of the model.
         key: Random key for the choice of inputs and for the noise.
         inputs: All inputs of the model by name: images `visual` and `tactile` `(n, size, size, 3)` in [0, 1] with the
             side `input_size`, and pose codes `pose` `(n, 12)`.

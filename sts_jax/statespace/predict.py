@@ -109,9 +109,6 @@ def sample(
     """Sample final poses and images of the last frame, given inputs of the first frame.
 
     Args:
-        graphdef: Definition of the model, from `init`.
-        params: Parameters of the model.
-        key: Random key for the samples.
         inputs: One or more inputs of n items, by name. `visual` and `tactile` are images in [0, 1], `(n, size, size,
             3)`, where size is `Config.input_size`. `pose` has pose codes, `(n, 12)`, and `state` true state codes, `(n,
             code)`.

@@ -66,7 +66,6 @@ def optimiser(config: TrainConfig, total: int) -> optax.GradientTransformation:
     """Make the default optimiser: Adam with a learning rate schedule and gradient clipping.
 
     Args:
-        config: Options of the training.
         total: Number of steps of the whole training. A cosine schedule reaches 0 after these steps.
     """
     rate: float | optax.Schedule = config.learning_rate

@@ -78,8 +78,6 @@ def save(folder: Path, state: TrainState, *, compact: bool = False) -> None:
     """Write a checkpoint, then delete older checkpoints. If it fails, the previous checkpoint stays the current one.
 
     Args:
-        folder: Folder of the model.
-        state: State of the training.
         compact: True writes all arrays to one small file with rounded weights. A weight w is stored as a 16-bit integer
             q, with `w = q s`. Each output channel of a kernel has its own step `s = max(rms / 128, largest / 32767)`.
             Vectors, such as biases, are unchanged.
@@ -122,7 +120,6 @@ def restore(folder: Path, like: TrainState) -> TrainState | None:
     """Read the current checkpoint, after comparing all files with the manifest. None without a checkpoint.
 
     Args:
-        folder: Folder of the model.
         like: State with the structure, shapes and dtypes of the state to read. The leaves may be abstract arrays, and
             the optimiser may be None.
     """
@@ -226,7 +223,6 @@ def save_calibration(
     """Write the calibration of a model's current checkpoint.
 
     Args:
-        folder: Folder of the model.
         calibration: From `statespace.fit_calibration`.
         inputs: Inputs of the model, `Config.inputs`.
         data: Checksum of the arrays to which it was fitted, `Arrays.checksum`. None if unknown.

@@ -30,9 +30,7 @@ class Loss(Protocol):
         """Compute the loss of one batch.
 
         Args:
-            graphdef: Definition of the model.
             params: Parameters of the model. The loss is differentiated by them.
-            stats: Running batch statistics of the model.
             key: Random key, another one in every step.
             batch: Arrays of the batch, from `Arrays.take`, with images as float32 in [0, 1].
             beta: Weight of the divergence, which rises from 0 to 1 over the share `TrainConfig.beta_warmup` of the
@@ -59,7 +57,6 @@ def learner(model: Config, *, targets: Literal["all", "own"] = "all", absent: tu
     """Make the learner of a model, with the loss `mvae.loss` or `statespace.loss`.
 
     Args:
-        model: Configuration of the model.
         targets: For `mvae` models: modalities to predict from each subset of the inputs, every modality (`all`) or only
             those in the subset (`own`).
         absent: For `mvae` models: names of modalities that are not inputs of any sample.

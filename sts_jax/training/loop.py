@@ -36,7 +36,6 @@ def initial(
     """Initialise a model and the state of its training from `config.seed`.
 
     Args:
-        config: Options of the training.
         learner: Initialisation and loss of the model, from `training.learner`.
         total: Number of steps of the whole training, for the schedule of the default optimiser.
         optimiser: Optimiser (default: the optimiser from `training.optimiser`).
@@ -63,11 +62,8 @@ def step(
 
     Args:
         learner: Loss of the model, from `training.learner`.
-        graphdef: Definition of the model.
-        config: Options of the training.
         total: Number of steps of the whole training, for the schedules of the learning rate and of beta, the weight of
             the divergence in the loss.
-        state: State before the step.
         batch: Arrays of the batch, from `Arrays.take`. uint8 images are converted to float32 in [0, 1].
         optimiser: Optimiser that made `state` (default: the optimiser from `training.optimiser`).
 
@@ -114,9 +110,6 @@ def train(
     settings, data or optimiser is refused.
 
     Args:
-        config: Options of the training.
-        model: Configuration of the model.
-        arrays: Training set.
         workdir: Folder of the model, see `sts_jax.training.folder` for its files.
         absent: For `mvae` models: names of modalities that are not inputs of any sample. `arrays.inputs` need not have
             them.

@@ -101,7 +101,6 @@ def calibrate(workdir: str | os.PathLike[str], arrays: Arrays) -> Model:
     fitted or written.
 
     Args:
-        workdir: Folder of the model.
         arrays: Trajectories of objects that the model was not trained on, from `state_arrays`.
 
     Returns:

@@ -218,7 +218,6 @@ def state_codes(
     """Encode the true states of n objects as state codes `(n, code)`.
 
     Args:
-        preprocessing: Preprocessing of the model.
         pose: Poses `(n, 7)`.
         support: Support functions of the convex hulls for `objects.DIRECTIONS`, `(n, 128)` (m).
         mass: Masses, `(n,)` (kg).
