@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
-from optics_bodies import at, body_mesh, embree, from_trimesh, interior, weight
+from optics_bodies import at, body_mesh, from_trimesh, weight
 
 import sts_jax as sts
 from sts_jax import objects, sense, tactile
@@ -68,18 +68,6 @@ def test_a_letter_is_not_mirrored_in_either_stream(resolution):
         red, green, _ = np.asarray(frame.visual)[pixel(x, y)]
         assert abs(red - green) < 0.1
         np.testing.assert_allclose(np.asarray(frame.tactile)[pixel(x, y)], FLAT, atol=0.02)
-
-
-def test_depth_and_segmentation_equal_embrees_for_the_balanced_pose():
-    body, resolution = objects.make(jax.random.key(4), "spoon"), (64, 64)
-    pose = jnp.asarray([0.01, -0.01, 0.03, 0.8, 0.6, 0.0, 0.0])
-    frame = sense(SENSOR, body, pose, weight(0.0, 0, 0), resolution=resolution)
-    truth = embree(body_mesh(body, frame.pose), SENSOR.camera, resolution)
-    inner = interior(truth)
-    error = np.abs(np.asarray(frame.depth)[inner] - truth[inner])
-    assert np.sum(error > 1e-4) <= 0.01 * error.size
-    assert np.mean(np.asarray(frame.segmentation) != np.isfinite(truth)) < 2e-3
-    assert np.array_equal(np.isfinite(frame.depth), frame.segmentation)
 
 
 def test_depth_of_the_balanced_pose_matches_its_pressure():

@@ -113,7 +113,7 @@ def test_images_are_found_in_the_folder_of_textures(tmp_path):
     np.testing.assert_allclose(entry.body.texture[128, 128], linear(np.array(paint) / 255), atol=1e-5)
     np.testing.assert_allclose(entry.body.colors[0], 1)  # and not the Kd
     (tmp_path / "models-textures" / "textures" / "a.png").unlink()
-    assert "a.png. Add these files" in objects.read(objects.library(tmp_path), 0).notes[0]
+    assert "a.png. Add them" in objects.read(objects.library(tmp_path), 0).notes[0]
 
 
 def test_a_larger_object_is_scaled_down_with_a_note(tmp_path):

@@ -68,10 +68,7 @@ def assemble(
 
     contents = np.zeros((0, 3, 3)) if interior is None else (interior[0] - origin)[interior[1]]
     if interior is not None and not solid_moments(contents).sum(axis=0)[0] > 0:
-        raise ValueError(
-            "the mesh `interior`, which bounds the contents, encloses no volume: close this mesh, or turn its faces "
-            "outwards"
-        )
+        raise ValueError("the mesh `interior` encloses no volume: close it, or turn its faces outwards")
 
     size = size_class(max(len(faces), len(vertices), len(contents)), FACE_CLASSES)
     single = np.float32

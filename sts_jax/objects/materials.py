@@ -42,18 +42,12 @@ def check_materials(path: Path, images: Path | None, strict: bool) -> None:
     if path.suffix.lower() != ".obj":
         return
     files = references(path, images)
-    missing = [str(path.parent / name) for name, file in files.items() if file is None]
-    if missing and strict:
-        raise FileNotFoundError(
-            f"{path}: the mesh refers to missing files: {', '.join(missing)}. Add these files, or give an image "
-            "(argument texture)"
-        )
+    missing = ", ".join(str(path.parent / name) for name, file in files.items() if file is None)
     if missing:
-        warnings.warn(
-            f"{path}: colours are missing, because the mesh refers to missing files: {', '.join(missing)}. Add these "
-            "files, or give an image (argument texture)",
-            stacklevel=3,
-        )
+        problem = f"{path}: the mesh refers to missing files: {missing}. Add them, or give an image (argument texture)"
+        if strict:
+            raise FileNotFoundError(problem)
+        warnings.warn(problem, stacklevel=3)
     for file in files.values():
         if file is not None and file.suffix.lower() != ".mtl":
             read_image(file)

@@ -39,16 +39,11 @@ def rotation(up: Sequence[float], front: Sequence[float]) -> Float[np.ndarray, "
     except (TypeError, ValueError):  # not numbers
         valid = False
     if not valid:
-        raise ValueError(
-            f"up is {up} and front is {front}, but each must be three finite numbers, and up must not be (0, 0, 0)"
-        )
+        raise ValueError(f"up and front must be three finite numbers, and up not (0, 0, 0), got {up} and {front}")
     z /= np.linalg.norm(z)
     across = y - (y @ z) * z
     if not np.linalg.norm(across) > 1e-3 * np.linalg.norm(y):
-        raise ValueError(
-            f"front is {tuple(front)} and up is {tuple(up)}, but they must not be parallel, and front must not be "
-            "(0, 0, 0): give a front direction perpendicular to up"
-        )
+        raise ValueError(f"up and front must not be parallel, and front not (0, 0, 0), got {up} and {front}")
     y = across / np.linalg.norm(across)
     return np.stack([np.cross(y, z), y, z])
 
@@ -137,10 +132,7 @@ def _attitude(
     if not isinstance(up, str):
         return rotation(up, AXES["z"][1] if front is None else front)
     if up not in AXES or front is not None:
-        raise ValueError(
-            f"up is {up!r} and front is {front}: give 'x', 'y' or 'z' as `up` and omit `front`, or give a direction of "
-            "three numbers as `up`"
-        )
+        raise ValueError(f"with up={up!r} and front={front}: give an axis x, y or z without front, or two directions")
     return rotation(*AXES[up])
 
 
@@ -153,8 +145,8 @@ def _read(path: Path, images: Path | None) -> list[trimesh.Trimesh]:
         return [piece for piece in scene.dump() if isinstance(piece, trimesh.Trimesh) and len(piece.faces)]
     except ModuleNotFoundError as error:
         # For text that is not UTF-8, trimesh imports a package that is not one of its requirements.
-        install = f"install the package {error.name}"
-        remedy = "the file is truncated or damaged: replace it" if error.name == "charset_normalizer" else install
+        damaged = error.name == "charset_normalizer"
+        remedy = "the file is truncated or damaged: replace it" if damaged else f"install the package {error.name}"
         raise ValueError(f"the file cannot be read as a mesh ({error}): {remedy}") from error
     except Exception as error:  # trimesh's many readers raise errors of many types
         raise ValueError(

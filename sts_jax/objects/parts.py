@@ -13,8 +13,6 @@ from sts_jax.objects.body import HULL_CLASSES, PART_CLASSES, Body, pad, size_cla
 from sts_jax.objects.hulls import convex_hull, outside_hull
 from sts_jax.objects.surface import surface_samples
 
-_KEEP = "use the body without a decomposition, so that it collides as its convex hull"
-
 
 def convex_parts(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> list[Float[np.ndarray, "_ 3"]]:
     """Vertices (m) of the convex parts of a surface, the largest first (CoACD: Wei et al., 2022, SIGGRAPH).
@@ -39,10 +37,12 @@ def convex_parts(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3
             seed=0,
         )
         parts = [convex_hull(np.asarray(corners, float), limit=HULL_CLASSES[0]) for corners, _ in pieces]
+        if not parts:
+            raise ValueError("no parts")
     except (RuntimeError, ValueError) as error:
-        raise ValueError(f"the surface cannot be decomposed into convex parts ({error}): {_KEEP}") from error
-    if not parts:
-        raise ValueError(f"the surface cannot be decomposed into convex parts: {_KEEP}")
+        raise ValueError(
+            f"the surface cannot be decomposed into convex parts ({error}): use the body without a decomposition"
+        ) from error
     return sorted(parts, key=lambda part: (-ConvexHull(part).volume, *part[0]))
 
 

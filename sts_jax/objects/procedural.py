@@ -69,8 +69,7 @@ def find_family(category: str) -> Family:
     if not isinstance(family, Family):
         fault = "does not exist" if family is None else f"is of type {type(family).__name__}"
         raise ValueError(
-            f"category is {category!r}, but the variable {name} of the module {module} {fault}: assign an "
-            f"objects.Family to {name}"
+            f"category is {category!r}, but the variable {name} of {module} {fault}: assign a Family to it"
         )
     return family
 
