@@ -6,15 +6,15 @@ The lights are off in the visual stream and on in the tactile stream. `docs/hard
 import dataclasses
 import time
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from sts_jax.hardware import protocol
-from sts_jax.hardware.camera import Camera, CameraError, CameraLostError, Captured
-from sts_jax.hardware.leds import DisconnectedError, Leds, LedTimeoutError, Lit
+from sts_jax.hardware.camera import CameraError, CameraLostError, Captured
+from sts_jax.hardware.leds import DisconnectedError, LedTimeoutError, Lit
 
 _SIZE = 32, 24  # width and height of a thumbnail (pixels). Each pixel is the mean of many, which averages noise out
 _LEAST_CONTRAST = 2.0  # smallest mean difference of thumbnails between lights off and on (of 255)
@@ -151,6 +151,43 @@ def last_mixed(switch: Switch, dark: Thumbnail, lit: Thumbnail) -> float:
     return max(float(switch.delays_s[mixed[-1]]), 0.0) if len(mixed) else 0.0
 
 
+@runtime_checkable
+class FrameSource(Protocol):
+    """The part of a `Camera` that the proof of light needs."""
+
+    @property
+    def source(self) -> str:
+        """Name of the camera."""
+
+    def async_read(self, timeout_ms: float | None = None) -> Captured:
+        """Return the oldest frame that was not returned yet, or wait for the next one."""
+
+
+@runtime_checkable
+class Lights(Protocol):
+    """The part of `Leds` that the proof of light needs."""
+
+    def set(self, levels: protocol.Levels) -> Lit:
+        """Set the levels."""
+
+    def ping(self) -> Lit:
+        """Ask for the levels."""
+
+    def reconnect(self, *, limit_s: float) -> object:
+        """Search a lost controller for at most a time (s)."""
+
+
+@runtime_checkable
+class Clock(Protocol):
+    """The functions of the module `time` that the proof of light needs. A twin has a virtual clock."""
+
+    def monotonic(self) -> float:
+        """The current time (s)."""
+
+    def sleep(self, seconds: float, /) -> None:
+        """Wait (s)."""
+
+
 class ProvenFrames:
     """Switches the lights of a connected sensor, and takes frames that are proven to show the new state of the lights.
 
@@ -163,16 +200,17 @@ class ProvenFrames:
 
     def __init__(
         self,
-        camera: Camera,
-        leds: Leds,
+        camera: FrameSource,
+        leds: Lights,
         *,
         levels: protocol.Levels,
         exposures: tuple[float, float] | None,
         timeout_s: float,
         reconnect_s: float,
+        clock: Clock = time,
     ):
         """Use open devices, see `STS`. Call `measure_settling` or `see_both` before the first image is taken."""
-        self._camera, self._leds = camera, leds
+        self._camera, self._leds, self._clock = camera, leds, clock
         self._levels, self._exposures = levels, exposures
         self._timeout_s, self._reconnect_s = timeout_s, reconnect_s
         self._settling: Settling | None = None
@@ -212,9 +250,9 @@ class ProvenFrames:
         shorter_s = min(3 * slowest_s + 3 * period_s, watch_s)
         for number in range(1, switches):
             phase_s = period_s * (_PHASE * number % 1)  # the collection of frames ends just after a frame
-            time.sleep(phase_s)
+            self._clock.sleep(phase_s)
             on.append(self._watched("tactile", shorter_s))
-            time.sleep(phase_s)
+            self._clock.sleep(phase_s)
             off.append(self._watched("visual", shorter_s))
         measured = settling(on, off, period_s)
         if max(measured.visual_s, measured.tactile_s) > shorter_s - period_s:
@@ -246,7 +284,7 @@ class ProvenFrames:
         second: Stream = "tactile" if first == "visual" else "visual"
         while True:
             lost_s = self._lost_s
-            one = self.shot(first, deadline, after_s=time.monotonic(), then=second)
+            one = self.shot(first, deadline, after_s=self._clock.monotonic(), then=second)
             deadline, lost_s = deadline + self._lost_s - lost_s, self._lost_s
             two = self.shot(second, deadline)
             if one.epoch == two.epoch and one.before.boot == two.before.boot:
@@ -272,10 +310,10 @@ class ProvenFrames:
                 before, frame = self._frame(stream, deadline, after_s)
                 until_s = self._proof(before, then)
             except (DisconnectedError, LedTimeoutError):
-                began_s = time.monotonic()
+                began_s = self._clock.monotonic()
                 self._lit, self._doubtful = None, True
                 self._leds.reconnect(limit_s=self._reconnect_s)
-                reconnected_s = time.monotonic() - began_s
+                reconnected_s = self._clock.monotonic() - began_s
                 self._lost_s, deadline = self._lost_s + reconnected_s, deadline + reconnected_s
                 continue
             if until_s is not None:
@@ -296,11 +334,11 @@ class ProvenFrames:
         lit, checked_s = self._switched(stream), 0.0
         assert self._settling is not None, "call measure_settling or see_both first"
         settled_s = self._settling.visual_s if stream == "visual" else self._settling.tactile_s
-        while (left_s := deadline - time.monotonic()) > 0:
+        while (left_s := deadline - self._clock.monotonic()) > 0:
             try:
                 frame = self._camera.async_read(1000 * (left_s + _GRACE_S))
             except CameraLostError:
-                if time.monotonic() >= deadline:
+                if self._clock.monotonic() >= deadline:
                     raise
                 continue
             spoilt = frame.repeats > 0 or (frame.black and self._black.get(stream) is False)
@@ -311,14 +349,14 @@ class ProvenFrames:
             if self._departed >= 2 and late_s >= 0 and not spoilt and not frame.delayed:
                 return lit, frame
             self.discarded += 1
-            if self._departed == 0 and late_s >= 0 and time.monotonic() >= checked_s + _CHECK_S:
+            if self._departed == 0 and late_s >= 0 and self._clock.monotonic() >= checked_s + _CHECK_S:
                 if not self._leds.ping().unchanged_since(lit):  # the watchdog or a restart has turned the lights off
                     lit = self._set(stream)
                 elif frame.time_s > lit.acknowledged_s + settled_s + _AGAIN_S:
                     # The scene may have changed at the switch. The repeated switch is compared with a newer frame.
                     self._watched("tactile" if stream == "visual" else "visual", settled_s)
                     lit = self._set(stream)
-                checked_s = time.monotonic()
+                checked_s = self._clock.monotonic()
         remedy = "check that the LEDs light up, that the camera's exposure is locked, and that enough frames arrive"
         if self._previous is not None and self._previous.black:
             remedy = "the frames are black now. Check the camera, or connect again if the scene has become dark"
