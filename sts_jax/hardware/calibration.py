@@ -5,6 +5,7 @@ import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -121,11 +122,10 @@ def board_image(
     frame = [round(1000 * side * _PIXELS_PER_MM) for side in outline]
     pixels = [round(1000 * side * _PIXELS_PER_MM) for side in board.size]
     largest = _PAGE[0] - 10, _PAGE[1] - 60
-    if pixels[0] > frame[0] or pixels[1] > frame[1]:
-        raise ValueError(f"the board of {_mm(board.size)} does not fit into outline={_mm(outline)}: use fewer squares")
-    if any(side > _PIXELS_PER_MM * limit for side, limit in zip(frame, largest, strict=True)):
+    if not all(p <= f <= _PIXELS_PER_MM * m for p, f, m in zip(pixels, frame, largest, strict=True)):
         raise ValueError(
-            f"outline is {_mm(outline)}, but must be at most {largest[0]} mm x {largest[1]} mm to fit on the A4 page"
+            f"outline is {_mm(outline)}, but must be at least the board's {_mm(board.size)}, and at most "
+            f"{largest[0]} mm x {largest[1]} mm to fit on an A4 page"
         )
     page = np.full((_PAGE[1] * _PIXELS_PER_MM, _PAGE[0] * _PIXELS_PER_MM), 255, np.uint8)
     left, top = (page.shape[1] - frame[0]) // 2, 10 * _PIXELS_PER_MM
@@ -241,81 +241,64 @@ def fit_lens(
         )
     counts = tuple(len(found.numbers) for found in corners)
     used = _usable(counts, on_pad)
-    views = _Views.of([corners[i] for i in used], board)
-    fit = _fitted(views, _first_estimate(views, width, height))
+    views = _Views(
+        image=np.repeat(np.arange(len(used)), [counts[i] for i in used]),
+        points=board.corners[np.concatenate([corners[i].numbers for i in used])],
+        pixels=np.concatenate([corners[i].pixels for i in used]),
+    )
+
+    def loss(unknowns: np.ndarray) -> np.ndarray:
+        return np.concatenate([views.residuals(unknowns)[0].ravel(), _PRIOR * unknowns[4:8]])
+
+    start = _first_estimate(views, width, height)
+    fit = optimize.least_squares(loss, start, x_scale="jac", loss="soft_l1", max_nfev=200).x
+    residuals, angle = views.residuals(fit)
     errors: list[float | None] = [None] * len(corners)
     for row, i in enumerate(used):
-        errors[i] = math.sqrt(float(np.mean(np.sum(fit.residuals[views.image == row] ** 2, axis=-1))))
+        errors[i] = math.sqrt(float(np.mean(np.sum(residuals[views.image == row] ** 2, axis=-1))))
     _check_errors(errors, largest_error)
-    _check_tilts(fit.poses)
-    rotation, translation = _pose_on_pad(fit.poses[used.index(on_pad)], on_pad)
-    lens = Lens(width, height, *fit.focal, *fit.center, fit.k, rotation, translation)
-    return Calibration(lens, tuple(errors), counts, fit.largest_angle)
+    poses = fit[8:].reshape(-1, 6)
+    _check_tilts(poses)
+    fx, fy, cx, cy, k1, k2, k3, k4 = fit[:8].tolist()
+    lens = Lens(width, height, fx, fy, cx, cy, (k1, k2, k3, k4), *_pose_on_pad(poses[used.index(on_pad)], on_pad))
+    return Calibration(lens, tuple(errors), counts, float(angle.max()))
 
 
-@dataclasses.dataclass(frozen=True)
-class _Views:
-    """The corners of all usable images, concatenated."""
+class _Views(NamedTuple):
+    """The n corners of all usable images, concatenated."""
 
     image: np.ndarray  # index of each corner's image among the usable images, shape (n,)
     points: np.ndarray  # position of each corner in the board's frame (m), shape (n, 3)
     pixels: np.ndarray  # raw pixel coordinates of each corner, shape (n, 2)
-    number: int  # number of usable images
 
-    @classmethod
-    def of(cls, corners: list[FoundCorners], board: Board) -> "_Views":
-        points = board.corners
-        return cls(
-            image=np.repeat(np.arange(len(corners)), [len(found.numbers) for found in corners]),
-            points=np.concatenate([points[found.numbers] for found in corners]),
-            pixels=np.concatenate([found.pixels for found in corners]),
-            number=len(corners),
-        )
+    def residuals(self, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Projections minus found corners (pixels), shape (n, 2), and angles from the optical axis (rad), shape (n,).
 
-
-@dataclasses.dataclass(frozen=True)
-class _Fit:
-    """A lens and the pose of the board in each image, with the residuals of the corners."""
-
-    focal: tuple[float, float]  # fx and fy (pixels per radian)
-    center: tuple[float, float]  # cx and cy (pixels)
-    k: tuple[float, float, float, float]  # k1 to k4 of the lens
-    poses: np.ndarray  # rotation vector (rad) and translation (m) from board to camera, shape (images, 6)
-    residuals: np.ndarray  # projections minus found corners (pixels), shape (n, 2)
-    largest_angle: float  # largest angle of a corner from the optical axis (rad)
-
-    @property
-    def unknowns(self) -> np.ndarray:
-        """Focal lengths, centre, k and the poses of m images as one vector, shape (8 + 6 m,)."""
-        return np.concatenate([self.focal, self.center, self.k, self.poses.ravel()])
-
-    @classmethod
-    def of(cls, views: _Views, unknowns: np.ndarray) -> "_Fit":
-        """Project the corners with the lens and the poses in `unknowns`, and compute the residuals."""
-        fx, fy, cx, cy, k1, k2, k3, k4 = unknowns[:8].tolist()
+        Args:
+            unknowns: fx, fy, cx, cy, k1 to k4 and, for each image, rotation vector and translation (m) from board to
+                camera, shape (8 + 6 images,).
+        """
         poses = unknowns[8:].reshape(-1, 6)
-        matrices = Rotation.from_rotvec(poses[:, :3]).as_matrix()[views.image]
-        points = np.einsum("nij,nj->ni", matrices, views.points) + poses[views.image, 3:]
+        matrices = Rotation.from_rotvec(poses[:, :3]).as_matrix()[self.image]
+        points = np.einsum("nij,nj->ni", matrices, self.points) + poses[self.image, 3:]
         radius = np.hypot(points[:, 0], points[:, 1])
         angle = np.arctan2(radius, points[:, 2])
-        k = (k1, k2, k3, k4)
-        seen = points[:, :2] * (distort_angle(k, angle) / np.maximum(radius, 1e-12))[:, None]
-        residuals = seen * np.array([fx, fy]) + np.array([cx, cy]) - views.pixels
-        return cls((fx, fy), (cx, cy), k, poses, residuals, float(angle.max()))
+        seen = points[:, :2] * (distort_angle(unknowns[4:8].tolist(), angle) / np.maximum(radius, 1e-12))[:, None]
+        return seen * unknowns[:2] + unknowns[2:4] - self.pixels, angle
 
 
-def _first_estimate(views: _Views, width: int, height: int) -> _Fit:
-    """The equidistant lens of the field of view in `_STARTS` that fits best, with a pose of the board in each image."""
-    best: _Fit | None = None
+def _first_estimate(views: _Views, width: int, height: int) -> np.ndarray:
+    """The equidistant lens of `_STARTS` that fits best, with the pose of the board in each image, as unknowns."""
+    best: np.ndarray | None = None
+    smallest = math.inf
     for field_of_view in _STARTS:
         focal, middle = math.hypot(width, height) / field_of_view, ((width - 1) / 2, (height - 1) / 2)
         offset = (views.pixels - middle) / focal
         angle = np.hypot(*offset.T)
-        usable = angle < _WIDEST
         plane = offset * (np.tan(np.minimum(angle, _WIDEST)) / np.maximum(angle, 1e-12))[:, None]
-        poses = []
-        for i in range(views.number):
-            rows = usable & (views.image == i)
+        unknowns = [np.array([focal, focal, *middle, 0, 0, 0, 0])]
+        for i in np.unique(views.image):
+            rows = (angle < _WIDEST) & (views.image == i)
             if np.count_nonzero(rows) < FEWEST_CORNERS // 2:
                 break
             solved, rotation, translation = cv2.solvePnP(
@@ -323,24 +306,14 @@ def _first_estimate(views: _Views, width: int, height: int) -> _Fit:
             )
             if not solved:
                 break
-            poses.append(np.concatenate([rotation.ravel(), translation.ravel()]))
-        if len(poses) == views.number:
-            fit = _Fit.of(views, np.concatenate([[focal, focal, *middle, 0, 0, 0, 0], *poses]))
-            if best is None or np.abs(fit.residuals).mean() < np.abs(best.residuals).mean():
-                best = fit
+            unknowns += [rotation.ravel(), translation.ravel()]
+        else:
+            error = np.abs(views.residuals(np.concatenate(unknowns))[0]).mean()
+            if error < smallest:
+                best, smallest = np.concatenate(unknowns), error
     if best is None:
         raise CalibrationError(f"the pose of the board cannot be computed from the corners that were found: {_SHARP}")
     return best
-
-
-def _fitted(views: _Views, start: _Fit) -> _Fit:
-    """Minimise the residuals of the corners and of the prior, beginning at `start`."""
-
-    def residuals(unknowns: np.ndarray) -> np.ndarray:
-        return np.concatenate([_Fit.of(views, unknowns).residuals.ravel(), _PRIOR * unknowns[4:8]])
-
-    result = optimize.least_squares(residuals, start.unknowns, x_scale="jac", loss="soft_l1", max_nfev=200)
-    return _Fit.of(views, result.x)
 
 
 def _usable(counts: tuple[int, ...], on_pad: int) -> list[int]:

@@ -103,7 +103,6 @@ class _Motion(NamedTuple):
     wrench: np.ndarray  # force (N) and moment (N m) of the pad on the object, shape (frames, 6)
     rate: float  # frame rate of the simulation (frames/s)
     rest: int  # first frame from which on the object is at rest
-    outcome: str  # outcome in words
 
     def drawn(self, elapsed_s: float, motion_rate: float) -> int:
         """Index of the pose that is rendered at a time after the release (s). An object at rest is in the last pose."""
@@ -166,10 +165,6 @@ class ObjectScene(Scene):
         self._working = threading.Lock()  # lets one simulation or rendering run at a time
         self._wake, self._stop = threading.Event(), threading.Event()
         self._thread: threading.Thread | None = None
-
-    def outcome(self, trajectory: int) -> str:
-        """The outcome of a trajectory (number from 0) in words, such as "topples"."""
-        return self._motion(trajectory).outcome
 
     def at(self, time_s: float) -> Seen:
         """Return the state of the scene at a time (s)."""
@@ -274,9 +269,7 @@ class ObjectScene(Scene):
         batch = physics.simulate(key, self._body, self.sensor, self.scenario, num=_BATCH)
         poses, wrenches = np.asarray(batch.pose), np.asarray(batch.wrench)
         return [
-            _Motion(poses[i], wrenches[i], self.scenario.rate, _rest(poses[i]), self.scenario.named(int(outcome)))
-            for i, outcome in enumerate(batch.outcome)
-            if batch.settled[i]
+            _Motion(poses[i], wrenches[i], self.scenario.rate, _rest(poses[i])) for i in np.flatnonzero(batch.settled)
         ]
 
     def _render(self, trajectory: int, frame: int, blender: Blender) -> Ends:
