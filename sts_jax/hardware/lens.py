@@ -180,13 +180,26 @@ def rectified(
     return _averaged(sampled, resolution)
 
 
-def distortion(lens: Lens, pinhole: Camera, resolution: tuple[int, int]) -> Float[np.ndarray, "rows columns 2"]:
-    """Rectified pixel of each raw pixel, as float32. Inverse of `rectification`.
+def distortion(
+    lens: Lens, pinhole: Camera, resolution: tuple[int, int], samples: int = 1
+) -> Float[np.ndarray, "rows columns 2"]:
+    """Rectified pixel of each raw pixel, or of `samples` x `samples` points of it, as float32.
 
     The pixels lie outside of the rectified image for rays outside of the view. They are NaN for rays that do not meet
     the plane of the gel's outer face, or that are beyond `Lens.largest_angle`.
     """
-    return _view_pixels(lens, pinhole, resolution, 1)
+    left, top, width, height = window(pinhole, resolution)
+    scale = np.array([resolution[1] / width, resolution[0] / height])
+    x = (np.arange(lens.width * samples) + 0.5) / samples - 0.5
+    y = (np.arange(lens.height * samples) + 0.5) / samples - 0.5
+    pixels = np.empty((len(y), len(x), 2), np.float32)
+    for first in range(0, len(y), _BAND):
+        grid = np.stack(np.meshgrid(x, y[first : first + _BAND]), axis=-1)
+        rays = directions(lens, grid) @ lens.matrix  # in the sensor frame
+        outwards = np.where(rays[..., 2] > _GRAZING, rays[..., 2], np.nan)
+        on_face = lens.center[:2] - lens.center[2] / outwards[..., None] * rays[..., :2]
+        pixels[first : first + _BAND] = (on_face - np.array([left, top])) * scale - 0.5
+    return pixels
 
 
 @checked
@@ -254,27 +267,11 @@ def distorting_maps(
         most: Limit of the number that avoids aliasing. None: no limit.
     """
     if samples is None:
-        samples = _samples(_view_pixels(lens, pinhole, resolution, 1), resolution, 1)
+        samples = _samples(distortion(lens, pinhole, resolution), resolution, 1)
         samples = samples if most is None else min(samples, most)
     if samples < 1:
         raise ValueError(f"samples must be >= 1 or None, got {samples}")
-    return _fixed_point(_view_pixels(lens, pinhole, resolution, samples), resolution)
-
-
-def _view_pixels(lens: Lens, pinhole: Camera, resolution: tuple[int, int], samples: int) -> np.ndarray:
-    """The result of `distortion` at `samples` x `samples` points of every raw pixel."""
-    left, top, width, height = window(pinhole, resolution)
-    scale = np.array([resolution[1] / width, resolution[0] / height])
-    x = (np.arange(lens.width * samples) + 0.5) / samples - 0.5
-    y = (np.arange(lens.height * samples) + 0.5) / samples - 0.5
-    pixels = np.empty((len(y), len(x), 2), np.float32)
-    for first in range(0, len(y), _BAND):
-        grid = np.stack(np.meshgrid(x, y[first : first + _BAND]), axis=-1)
-        rays = directions(lens, grid) @ lens.matrix  # in the sensor frame
-        outwards = np.where(rays[..., 2] > _GRAZING, rays[..., 2], np.nan)
-        on_face = lens.center[:2] - lens.center[2] / outwards[..., None] * rays[..., :2]
-        pixels[first : first + _BAND] = (on_face - np.array([left, top])) * scale - 0.5
-    return pixels
+    return _fixed_point(distortion(lens, pinhole, resolution, samples), resolution)
 
 
 def _samples(coordinates: np.ndarray, size: tuple[int, int], probes: int) -> int:
