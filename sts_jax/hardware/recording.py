@@ -50,7 +50,6 @@ _AGAIN = "copy the recording again, or make a new one"
 # Largest delay at which `stream` still returns an image (s). The buffer of a real sensor's camera holds 8 frames, which
 # are about as much at 30 frames per second.
 _LATE_S = 0.25
-_UNEQUAL = 1  # largest difference between the lengths of two videos (frames)
 _NO_IMAGE = np.zeros((0, 0, 3), np.uint8)
 
 
@@ -253,7 +252,8 @@ class Replay:
         for shot in itertools.islice(self.stream(), 2 * len(self._stills)):
             if self._speed is not None and shot.time_s < called_s:
                 continue
-            if last is not None and last.stream != shot.stream and _connection(last) == _connection(shot):
+            connection = shot.epoch, shot.before.boot
+            if last is not None and last.stream != shot.stream and connection == (last.epoch, last.before.boot):
                 return Pair(last, shot) if shot.stream == "tactile" else Pair(shot, last)
             last = shot
         raise EOFError(f"{self._name} has no further pair of images: call connect() to start again, or use loop=True.")
@@ -282,25 +282,19 @@ class Replay:
                     time.sleep(max(due_s - time.monotonic(), 0.0))
                 image = frame.to_ndarray(format="rgb24")
                 image.flags.writeable = False
-                yield _moved(still, image, due_s, speed, lap * epochs)
-
-
-def _moved(still: Shot, image: np.ndarray, due_s: float, speed: float, epochs: int) -> Shot:
-    """The image on the clock of the replay."""
-
-    def moved(time_s: float) -> float:
-        return due_s + (time_s - still.time_s) / speed
-
-    before = dataclasses.replace(
-        still.before, sent_s=moved(still.before.sent_s), acknowledged_s=moved(still.before.acknowledged_s)
-    )
-    return dataclasses.replace(
-        still, image=image, time_s=due_s, epoch=still.epoch + epochs, before=before, until_s=moved(still.until_s)
-    )
-
-
-def _connection(shot: Shot) -> tuple[int, int]:
-    return shot.epoch, shot.before.boot
+                before, shift_s = still.before, due_s - still.time_s / speed
+                yield dataclasses.replace(
+                    still,
+                    image=image,
+                    time_s=due_s,
+                    epoch=still.epoch + lap * epochs,
+                    before=dataclasses.replace(
+                        before,
+                        sent_s=before.sent_s / speed + shift_s,
+                        acknowledged_s=before.acknowledged_s / speed + shift_s,
+                    ),
+                    until_s=still.until_s / speed + shift_s,
+                )
 
 
 def _recorded(folder: Path, videos: dict[Stream, Path]) -> list[Shot]:
@@ -334,7 +328,7 @@ def _unproven(videos: dict[Stream, Path]) -> list[Shot]:
     except EOFError as error:
         raise ValueError(f"a video is truncated ({error}): copy it again.") from error
     counts = {stream: len(seen) for stream, seen in times.items()}
-    if abs(counts["visual"] - counts["tactile"]) > _UNEQUAL:
+    if abs(counts["visual"] - counts["tactile"]) > 1:
         raise ValueError(
             f"the visual video has {counts['visual']} frames, but the tactile video has {counts['tactile']}: cut both "
             "to the same period of time, so that frames with the same number show the same moment."
