@@ -64,9 +64,9 @@ def test_missing_trajectories_and_sensor_files_are_errors_with_a_remedy(tmp_path
     record(tmp_path / "bare", 5, sensor_file=False)
     with pytest.raises(FileNotFoundError, match=r"sensor.json is missing.*experiments.commission"):
         table2.read(TINY, tmp_path / "bare")
-    hardware.Device.load(tmp_path / "few").save(tmp_path / "few", sts.Sensor())
+    hardware.Device.load(tmp_path / "few").save(tmp_path / "bare", sts.Sensor())
     with pytest.raises(ValueError, match="has no images of the empty pad"):
-        table2.read(TINY, tmp_path / "few")
+        table2.read(TINY, tmp_path / "bare")
 
 
 @pytest.mark.parametrize(
