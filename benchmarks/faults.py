@@ -46,6 +46,7 @@ READ_S = 2 * TIMEOUT_S + REQUEST_S + GRACE_S  # longest time of a read without a
 RECONNECTED_S = READ_S + RECONNECT_S + 2 * (HANDSHAKE_S + 2 * ANSWER_S)  # with a reconnection at up to two ports
 DARK_S = 0.1  # slack for lights that a busy machine turns off later than the watchdog's period
 PART = 40  # faults of one emulated sensor
+LONG = 0.15  # share of the faults of variable length that last 5 to 7 s, longer than the time limit of an image
 RETURN_S = 12.0  # longest wait for a pair after a fault: the camera's backoff after a fault of 7 s, and one read
 
 
@@ -55,8 +56,6 @@ class Args:
 
     number: int = 312  # number of faults
     seed: int = 0  # seed of the order, the times and the lengths of the faults
-    # share of the faults of variable length that last 5 to 7 s, longer than the time limit of an image, from 0 to 1
-    long: float = 0.15
     jobs: int = 1  # number of emulated sensors that are read at the same time, each in a process of its own
     only: tuple[str, ...] = ()  # kinds of faults (default: all)
     out: Path | None = None  # text file for the table (default: print only)
@@ -64,13 +63,8 @@ class Args:
     def __post_init__(self) -> None:
         if self.number < 1:
             raise ValueError(f"--number must be at least 1, got {self.number}")
-        if not 0 <= self.long <= 1:
-            raise ValueError(f"--long must be in [0, 1], got {self.long}")
         if unknown := set(self.only) - set(KINDS) - {KILLED}:
-            raise ValueError(
-                f"--only has unknown kinds {sorted(unknown)}, but each kind must be one of: "
-                f"{', '.join([*KINDS, KILLED])}"
-            )
+            raise ValueError(f"--only has unknown kinds {sorted(unknown)}: give {', '.join([*KINDS, KILLED])}")
 
 
 @dataclasses.dataclass
@@ -103,8 +97,8 @@ class Count:
 class Bench:
     """The emulated camera and LED controller, and the `hardware.STS` that uses them."""
 
-    def __init__(self, folder: Path, draw: random.Random, long: float):
-        self.folder, self.draw, self.long = folder, draw, long
+    def __init__(self, folder: Path, draw: random.Random):
+        self.folder, self.draw = folder, draw
         self.peer = SensorPeer(
             folder / "leds", fps=FPS, lag_s=draw.uniform(0.015, 0.12), exposure_s=draw.uniform(0.004, 0.016)
         )
@@ -145,8 +139,8 @@ def _usb_port(path: str) -> list_ports_common.ListPortInfo:
 
 
 def _length_s(bench: Bench, least_s: float, longest_s: float) -> float:
-    """Draw the length of a fault: 5 to 7 s for the share `bench.long` of the faults, else `least_s` to `longest_s`."""
-    return bench.draw.uniform(5, 7) if bench.draw.random() < bench.long else bench.draw.uniform(least_s, longest_s)
+    """Draw the length of a fault: 5 to 7 s for the share LONG of the faults, else `least_s` to `longest_s`."""
+    return bench.draw.uniform(5, 7) if bench.draw.random() < LONG else bench.draw.uniform(least_s, longest_s)
 
 
 # A fault lasts while its function runs. The function runs in a thread of its own, and the main thread reads pairs.
@@ -184,13 +178,9 @@ def _reset(bench: Bench) -> None:
     time.sleep(boot_s)
 
 
-def _unplugged(bench: Bench) -> None:
-    _unplugged_for(bench, _length_s(bench, 0.1, 1.5))
-
-
-def _unplugged_for(bench: Bench, seconds: float) -> None:
+def _unplugged(bench: Bench, seconds: float | None = None) -> None:
     bench.peer.unplug()
-    time.sleep(seconds)
+    time.sleep(_length_s(bench, 0.1, 1.5) if seconds is None else seconds)
     bench.plug_in(Path(bench.ports[0].device).name)
 
 
@@ -230,7 +220,7 @@ def _held_unplugged(bench: Bench) -> None:
     """Hold the camera's frames back in the network, and meanwhile unplug the controller and plug it in again."""
     bench.peer.camera.mode = "held"
     time.sleep(bench.draw.uniform(0.0, 0.1))
-    _unplugged_for(bench, bench.draw.uniform(0.02, 0.1))
+    _unplugged(bench, bench.draw.uniform(0.02, 0.1))
     time.sleep(bench.draw.uniform(0.2, 0.6))
     bench.peer.camera.mode = "live"
 
@@ -340,15 +330,7 @@ def kill(bench: Bench, count: Count) -> None:
         wait_s = time.monotonic() + bench.draw.uniform(0, 3)
         _until(lambda: time.monotonic() > wait_s and lights.off_after(0.0) is None, 60)
         if process.poll() is not None or lights.off_after(0.0) is not None:
-            status = process.poll()
-            reason = (
-                "but no light was on within 60 s"
-                if status is None
-                else f"but the program ended before, with exit status {status}: see its error output above"
-            )
-            raise RuntimeError(
-                "the program that reads the sensor was to be killed at a moment when a light is on, " + reason
-            )
+            raise RuntimeError(f"no light was on within 60 s, exit status of the program: {process.poll()}")
         process.send_signal(signal.SIGKILL)
         process.wait()
         killed_s = time.monotonic()
@@ -375,7 +357,7 @@ def measure(args: Args) -> dict[str, Count]:
     order = [kinds[i % len(kinds)] for i in range(args.number)]
     random.Random(args.seed).shuffle(order)
     parts = [order[i : i + PART] for i in range(0, args.number, PART)]
-    tasks = [(part, args.seed + number, args.long) for number, part in enumerate(parts)]
+    tasks = [(part, args.seed + number) for number, part in enumerate(parts)]
     if args.jobs == 1:
         found = [measure_part(*task) for task in tasks]
     else:
@@ -388,11 +370,11 @@ def measure(args: Args) -> dict[str, Count]:
     return counts
 
 
-def measure_part(order: list[str], seed: int, long: float) -> dict[str, Count]:
+def measure_part(order: list[str], seed: int) -> dict[str, Count]:
     """Inject faults into one emulated sensor, whose camera has a random exposure time and a random lag."""
     counts = {kind: Count() for kind in order}
     with tempfile.TemporaryDirectory() as folder:
-        bench = Bench(Path(folder), random.Random(seed), long)
+        bench = Bench(Path(folder), random.Random(seed))
         try:
             with bench.connected() as sensor:
                 for kind in order:

@@ -11,7 +11,6 @@ both recorded sessions:
     python -m experiments.gap --real runs/gap-twin/device --sensor runs/gap-twin --simulated runs/gap-twin/clean
 """
 
-import contextlib
 import dataclasses
 import datetime
 import math
@@ -20,12 +19,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 import cv2
-import jax
 import numpy as np
 import tyro
 
 import sts_jax as sts
 from experiments.shared import drawing, terminal
+from experiments.shared.device import FIELD_OF_VIEW, TwinConfig, make_twin
 from experiments.shared.run import Folder
 from experiments.shared.terminal import Bar
 from sts_jax import hardware, storage
@@ -54,18 +53,17 @@ class Args:
     out: Path | None = None  # text file for the table (default: print only)
 
 
-def make(seed: int, imperfections: twin.Imperfections, lens: hardware.Lens | None) -> twin.Twin:
+def make(seed: int, imperfections: twin.Imperfections, *, lens: bool) -> twin.Twin:
     """Make a twin on a virtual clock, with a photo camera on the pad."""
-    sensor = sts.Sensor()
-    scene = twin.ObjectScene(
-        sts.objects.make(jax.random.key(seed), "camera"), resolution=SIZE, motion_rate=MOTION_RATE, seed=seed
+    field_of_view = FIELD_OF_VIEW if lens else None
+    config = TwinConfig(
+        resolution=SIZE, field_of_view=field_of_view, imperfections=imperfections, seed=seed, motion_rate=MOTION_RATE
     )
-    warp = None if lens is None else twin.lens_warp(lens, sensor.camera, SIZE)
-    return twin.Twin(scene, imperfections=imperfections, warp=warp, seed=seed)
+    return make_twin(config, prepare=False)
 
 
 def read_pair(device: twin.Twin) -> tuple[hardware.Pair, tuple[float, ...]]:
-    """Take a visual and a tactile image of an unmoving object, with a digital twin (a simulated sensor)."""
+    """Take a visual and a tactile image of an unmoving object, and return them with its pose from the twin's log."""
     shots, poses = [], []
     streams: tuple[tuple[Literal["visual", "tactile"], tuple[int, ...], float], ...] = (
         ("visual", OFF, 0.0),
@@ -75,14 +73,10 @@ def read_pair(device: twin.Twin) -> tuple[hardware.Pair, tuple[float, ...]]:
         before = device.set(levels)
         device.step(SETTLE_S)
         truth, image = device.capture()
-        if not truth.lowest == truth.highest == light:
-            raise AssertionError(
-                f"during the whole exposure of the {stream} frame, the relative brightness of the light must be "
-                f"{light}, got {truth.lowest} to {truth.highest}"
-            )
+        assert truth.lowest == truth.highest == light, f"the light changed during the {stream} exposure"
+        assert truth.pose is not None
         after = device.ping()
         shots.append(hardware.Shot(image, stream, device.now_s, truth.index, 1, before, after.sent_s))
-        assert truth.pose is not None
         poses.append(truth.pose)
     device.set(OFF)
     assert poses[0] == poses[1], "the object moved between the visual and the tactile image"
@@ -94,28 +88,16 @@ def release(device: twin.Twin) -> None:
     device.command("release")
     until_s = device.now_s + LONGEST_S
     while device.state.phase != twin.Phase.STILL:
-        if device.now_s > until_s:
-            raise AssertionError(f"{LONGEST_S} s after the command 'release', the twin's object is still moving")
+        assert device.now_s < until_s, "the object does not come to rest"
         device.step(0.1)
 
 
-@contextlib.contextmanager
-def recording(folder: Path, note: str) -> Iterator[hardware.Session]:
-    """Open a session, whose images have all been written when the `with` block ends."""
-    origin = hardware.Origin(note, "TWIN", SIZE[1], SIZE[0], ON)
-    with hardware.Session(folder, origin) as session:
-        yield session
-
-
 def record(device: twin.Twin, folder: Path, count: int, note: str, bar: Bar) -> list[tuple[float, ...]]:
-    """Record trajectories of a digital twin (a simulated sensor)."""
+    """Record trajectories of a twin, and return the poses of all pairs."""
     poses = []
-    with recording(folder, note) as session:
+    with hardware.Session(folder, hardware.Origin(note, "TWIN", SIZE[1], SIZE[0], ON)) as session:
         if session.confirmed:
-            raise ValueError(
-                f"the number of confirmed trajectories in {folder} must be 0, got {session.confirmed}: delete the "
-                "folder, or choose another --workdir"
-            )
+            raise ValueError(f"{folder} has {session.confirmed} trajectories already: delete it, or give --workdir")
         for done in range(count):
             bar(note, done, count)
             session.check_ready()
@@ -137,14 +119,10 @@ def sessions(args: Args) -> hardware.Recordings:
     lens = hardware.Lens.ideal(SIZE[1], SIZE[0])
     poses = []
     with Bar() as bar:
-        for name, imperfections, own in (("device", twin.Imperfections(), lens), ("clean", CLEAN, None)):
-            with make(args.seed, imperfections, own) as device:
+        for name, imperfections in (("device", twin.Imperfections()), ("clean", CLEAN)):
+            with make(args.seed, imperfections, lens=name == "device") as device:
                 poses.append(record(device, args.workdir / name, args.trajectories, name, bar))
-    if poses[0] != poses[1]:
-        raise AssertionError(
-            f"the simulated sessions 'device' and 'clean' in {args.workdir} have the same seed ({args.seed}), but the "
-            f"poses of the object differ: delete {args.workdir} and run again"
-        )
+    assert poses[0] == poses[1], "the poses of the object differ between both sessions"
     hardware.Device(
         camera="http://127.0.0.1/camera",
         fps=30.0,
@@ -249,17 +227,11 @@ def table(clean: gap.Streams, resolution: tuple[int, int]) -> Iterator[str]:
 
 def main(args: Args) -> None:
     """Record the image folders `device` and `clean`, then print the table of distances between sets of images."""
-    if args.trajectories < 2 * gap.FOLDS:
-        raise ValueError(
-            f"--trajectories must be >= {2 * gap.FOLDS}, so that two halves of the trajectories can be compared, "
-            f"got {args.trajectories}"
-        )
     height, width = args.resolution
-    if min(args.resolution) < gap.LEAST_SIDE or not math.isclose(width / height, SIZE[1] / SIZE[0]):
-        raise ValueError(
-            f"--resolution must be of the aspect ratio {SIZE[0]}:{SIZE[1]} (height:width) with sides of at least "
-            f"{gap.LEAST_SIDE} pixels, got {height} x {width}"
-        )
+    if args.trajectories < 2 * gap.FOLDS:  # two halves are compared
+        raise ValueError(f"--trajectories must be >= {2 * gap.FOLDS}, got {args.trajectories}")
+    if not math.isclose(width / height, SIZE[1] / SIZE[0]):
+        raise ValueError(f"--resolution must have the aspect ratio {SIZE[0]}:{SIZE[1]}, got {height} x {width}")
     if args.out is not None:
         drawing.make_folder(args.out.parent)
     recordings = sessions(args)

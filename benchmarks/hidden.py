@@ -2,7 +2,6 @@
 
     python -m benchmarks.hidden                 # the jerked pad, about half an hour on two CPU cores
     python -m benchmarks.hidden outcomes truth  # two of the four parts, which are listed below
-    python -m benchmarks.hidden --keep FOLDER   # keep the starts and outcomes in a folder, and resume from this folder
     python -m benchmarks.hidden outcomes truth --scenario inclined --soaked FOLDER  # load stored trajectories
 
 - `outcomes`: the share of each outcome, and the share of the starts whose outcome changes with other contents.
@@ -28,9 +27,9 @@ import numpy as np
 import tyro
 from jaxtyping import PRNGKeyArray
 
-from benchmarks.instruments import blocks, classifier, cnn, jerk_features, slope_features
-from benchmarks.instruments.starts import Starts, bodies, draw, kept, roll
-from sts_jax import objects, physics, storage
+from benchmarks.instruments import classifier, cnn, jerk_features, slope_features
+from benchmarks.instruments.starts import Starts, bodies, draw, roll, soaked
+from sts_jax import objects, physics
 from sts_jax.evaluation import metrics
 
 Part = Literal["outcomes", "truth", "pictures", "fill"]
@@ -98,19 +97,13 @@ class Args:
     again: int | None = None  # starts of each object that are simulated again with new contents (default: 8)
     others: int = 800  # number of objects on which the networks are trained
     steps: int = 1500  # training steps of the networks
-    keep: Path | None = None  # folder that keeps starts and outcomes, from which the next call resumes
     soaked: Path | None = None  # folder of kept blocks of `benchmarks.soak`, used instead of simulated starts
 
     def __post_init__(self) -> None:
-        known = STUDIES[self.scenario].parts
-        if unknown := [part for part in self.parts if part not in known]:
-            raise ValueError(
-                f"the report for --scenario {self.scenario} has no part named {', '.join(unknown)}: give some of its "
-                f"parts ({', '.join(known)})"
-            )
-        unused = [f"--{name}" for name in ("objects", "again", "keep") if getattr(self, name) is not None]
-        if self.soaked is not None and unused:
-            raise ValueError(f"--soaked provides the simulated trajectories: leave out {' and '.join(unused)}")
+        if unknown := set(self.parts) - set(STUDIES[self.scenario].parts):
+            raise ValueError(f"--scenario {self.scenario} has no part {', '.join(sorted(unknown))}")
+        if self.soaked is not None and (self.objects, self.again) != (None, None):
+            raise ValueError("--soaked provides the trajectories: leave out --objects and --again")
 
 
 def outcomes(study: Study, starts: Starts) -> None:
@@ -202,16 +195,11 @@ def fill(learned: Lesson, items: list[objects.Body], starts: Starts, num: int, s
 def begun(study: Study, args: Args) -> tuple[list[objects.Body], Starts]:
     """Return the objects, and the initial states and outcomes of their trajectories."""
     if args.soaked is not None:
-        starts = blocks.soaked(args.soaked, args.scenario)
+        starts = soaked(args.soaked, args.scenario)
         return bodies(study.categories, int(starts.body.max()) + 1), starts
-    count = 200 if args.objects is None else args.objects
+    items = bodies(study.categories, 200 if args.objects is None else args.objects)
     again = 8 if args.again is None else args.again
-    if args.keep is not None:
-        made = {"scenario": repr(study.scenario), "objects": count, "num": args.num, "again": again}
-        storage.claim(args.keep / f"{args.scenario}.json", made)
-    items = bodies(study.categories, count)
-    begin = functools.partial(roll, again=again, reroll=study.reroll)
-    return items, kept(args.keep, args.scenario, lambda: begin(jax.random.key(0), items, study.scenario, args.num))
+    return items, roll(jax.random.key(0), items, study.scenario, args.num, again=again, reroll=study.reroll)
 
 
 def main(args: Args) -> None:

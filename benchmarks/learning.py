@@ -21,7 +21,7 @@ from flax import nnx
 from jaxtyping import Array
 
 import sts_jax as sts
-from benchmarks.instruments.timing import in_turn
+from benchmarks.instruments.timing import median_seconds
 from sts_jax import mvae, statespace, training
 from sts_jax.mvae import networks
 
@@ -63,7 +63,7 @@ def stepper(model: mvae.Config, size: int, absent: tuple[str, ...]) -> Callable[
         else rng.random((size, *m.shape), np.float32)
         for m in model.modalities
     }
-    masks = {} if absent else {"tactile": np.zeros(size, bool)} if "tactile" in data else {}
+    masks = {"tactile": np.zeros(size, bool)} if "tactile" in data and not absent else {}
     inputs = {name: x for name, x in data.items() if name not in absent}
     batch = training.Arrays(inputs, data, masks).take(np.arange(size))
     config = training.TrainConfig(batch_size=size)
@@ -137,28 +137,22 @@ def state_predictor(num_samples: int) -> Callable[[], None]:
     return lambda: jax.block_until_ready(predict(visual=image, key=key, num_samples=num_samples)) and None
 
 
-def median_seconds(call: Callable[[], None], repeats: int) -> float:
-    """Median seconds of `repeats` calls, after one unmeasured call."""
-    return float(np.median(in_turn(call, repeats=repeats)))
-
-
 def paper() -> None:
     """Print how long training steps and a prediction take with the paper's model (ms)."""
     with mock.patch.multiple(networks, conv=plain_conv, conv_transpose=plain_conv_transpose):
         plain = stepper(MODEL, 64, ())
-    ours, enumerated = np.median(in_turn(stepper(MODEL, 64, ("tactile",)), plain, repeats=3), axis=0)
+    ours, enumerated = median_seconds(stepper(MODEL, 64, ("tactile",)), plain, repeats=3)
     ratio = enumerated / ours
     print(f"training step, batch 64: {1e3 * ours:.1f} ms, plain {1e3 * enumerated:.1f} ms, ratio {ratio:.1f}")
     for size in (16, 32):
-        print(f"training step, batch {size}: {1e3 * median_seconds(stepper(MODEL, size, ('tactile',)), 5):.1f} ms")
-    print(f"training step, visual only, batch 64: {1e3 * median_seconds(stepper(VISUAL, 64, ()), 5):.1f} ms")
-    print(f"prediction, batch 1: {1e3 * median_seconds(predictor(1), 50):.1f} ms")
+        show(f"training step, batch {size}", stepper(MODEL, size, ("tactile",)), 5)
+    show("training step, visual only, batch 64", stepper(VISUAL, 64, ()), 5)
+    show("prediction, batch 1", predictor(1), 50)
 
 
-def state_space() -> None:
-    """Print how long a training step and a prediction take with the state-space model (ms)."""
-    print(f"state-space model, training step, batch 32: {1e3 * median_seconds(state_stepper(32), 11):.1f} ms")
-    print(f"state-space model, prediction with 16 samples: {1e3 * median_seconds(state_predictor(16), 50):.1f} ms")
+def show(name: str, call: Callable[[], None], repeats: int) -> None:
+    """Print the median time of a function."""
+    print(f"{name}: {1e3 * median_seconds(call, repeats=repeats)[0]:.1f} ms")
 
 
 def main(args: Args) -> None:
@@ -167,7 +161,8 @@ def main(args: Args) -> None:
     if args.only != "statespace":
         paper()
     if args.only != "paper":
-        state_space()
+        show("state-space model, training step, batch 32", state_stepper(32), 11)
+        show("state-space model, prediction with 16 samples", state_predictor(16), 50)
 
 
 if __name__ == "__main__":

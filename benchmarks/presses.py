@@ -20,7 +20,6 @@ import functools
 import importlib.util
 import time
 from pathlib import Path
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -64,22 +63,12 @@ class Pixels:
     background: Float[Array, "p 3"]  # colour of the image without contact, [0, 1]
 
 
-class Descent(NamedTuple):
-    """The state of the optimisation in `refine` after a step: the optimised values and the state of Adam."""
-
-    unknowns: dict[str, Array]
-    optimiser: optax.OptState
-
-
 def read() -> Presses:
     """Read the images and contacts from the installed package `taxim`, without importing it."""
     spec = importlib.util.find_spec("taxim")
     path = Path(spec.origin or "").parent / "calib" / "gelsight" / "dataPack.npz" if spec else None
     if path is None or not path.is_file():
-        raise FileNotFoundError(
-            "the images of the presses are missing. They are part of the package taxim 1.4.1. Install it: "
-            "pip install -e '.[bench]' -c constraints.txt"
-        )
+        raise FileNotFoundError("the package taxim 1.4.1 is missing: pip install -e '.[bench]' -c constraints.txt")
     with np.load(path) as pack:
         background, images = (pack[name][..., ::-1] / np.float32(255) for name in ("f0", "imgs"))  # blue is first
         return Presses(background, images, pack["touch_center"], pack["touch_radius"].astype(np.float64))
@@ -187,11 +176,12 @@ def refine(unknowns: dict[str, Array], given: Pixels, *, near: bool, steps: int)
     def loss(unknowns: dict[str, Array]) -> Array:
         return jnp.mean((draw(*shader(unknowns, near=near), given) - given.color) ** 2)
 
-    def step(_: Array, state: Descent) -> Descent:
-        updates, moments = optimiser.update(jax.grad(loss)(state.unknowns), state.optimiser)
-        return Descent(optax.apply_updates(state.unknowns, updates), moments)
+    def step(_: Array, state: tuple[dict[str, Array], optax.OptState]) -> tuple[dict[str, Array], optax.OptState]:
+        unknowns, moments = state
+        updates, moments = optimiser.update(jax.grad(loss)(unknowns), moments)
+        return optax.apply_updates(unknowns, updates), moments
 
-    return jax.lax.fori_loop(0, steps, step, Descent(unknowns, optimiser.init(unknowns))).unknowns
+    return jax.lax.fori_loop(0, steps, step, (unknowns, optimiser.init(unknowns)))[0]
 
 
 def fit(given: Pixels, *, near: bool, steps: int = STEPS) -> tuple[tactile.Phong, tactile.Lights | tactile.Leds]:

@@ -37,15 +37,10 @@ class Args:
 
 def main(args: Args) -> str:
     """Draw predicted images (A to J) and true images (1 to 10) in one picture, and return the correct pairs as text."""
-    if args.first < 0:
-        raise ValueError(f"--first must be at least 0, got {args.first}")
     data = dataset.load(args.workdir / "dataset")
     rows = data.members("test")[args.first : args.first + NUMBER]
-    if len(rows) < NUMBER:
-        raise ValueError(
-            f"the held-out list must have at least {NUMBER} trajectories from index {args.first} (--first) on, got "
-            f"{len(rows)}: give a smaller --first or a run with more held-out trajectories"
-        )
+    if args.first < 0 or len(rows) < NUMBER:
+        raise ValueError(f"--first must leave at least {NUMBER} held-out trajectories, got {args.first}")
     pairs = data.pairs(rows)
     predictor = sts.Predictor.load(args.workdir / "models" / "statespace")
     given = args.given or predictor.modalities

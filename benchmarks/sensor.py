@@ -38,7 +38,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 import sts_jax as sts
-from benchmarks.instruments.timing import fresh, in_turn
+from benchmarks.instruments.timing import fresh, median_seconds
 from benchmarks.instruments.truth import public_meshes
 from experiments.shared.drawing import write_figure
 from sts_jax import geometry, objects, optics, tactile
@@ -162,11 +162,6 @@ def embree(body: objects.Body, poses: jax.Array, shape: tuple[int, int]) -> dict
         "built": [functools.partial(lambda vertices: trace(scene(vertices)), vertices) for vertices in posed],
         "trimesh": [functools.partial(trace_mesh, mesh) for mesh in meshes],
     }
-
-
-def median_seconds(*works: Callable[[], object], repeats: int = 7) -> list[float]:
-    """Median seconds of each function. All functions are called in turn, and this is repeated `repeats` times."""
-    return np.median(in_turn(*works, repeats=repeats), axis=0).tolist()
 
 
 @functools.partial(jax.jit, static_argnames=("shape", "fields", "batched"))

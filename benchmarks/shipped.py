@@ -24,23 +24,22 @@ from sts_jax import dataset, evaluation, physics, statespace
 
 PER_OBJECT = 4  # trajectories of each object
 REFERENCE = 0.2  # share of the objects that define the constant baseline and the frequencies of the outcomes
-METRICS = {metric.name: metric for metric in evaluation.METRICS}
 NUM_SAMPLES = 16  # samples of each prediction
-COLUMNS = (
-    evaluation.Column("visual skill", (METRICS["visual_skill"],)),
-    evaluation.Column("tactile skill", (METRICS["tactile_skill"],)),
-    evaluation.Column("position on pad (mm)", (METRICS["position_on_pad"],)),
-    evaluation.Column("balanced accuracy", (METRICS["outcome_balanced_accuracy"],)),
-    evaluation.Column("log loss (nats)", (METRICS["outcome_log_loss"],)),
-    evaluation.Column("calibration error", (METRICS["outcome_calibration_error"],)),
-    evaluation.Column("ROC area of falling off", (METRICS["fell_off_auc"],)),
-)
-SAMPLE_COLUMNS = (  # columns of the table of the samples
-    evaluation.Column(f"visual skill, best of {NUM_SAMPLES}", (METRICS["visual_skill_best"],)),
-    evaluation.Column("sharpness", (METRICS["sharpness"],)),
-    evaluation.Column("energy score (mm)", (METRICS["energy"],)),
-    evaluation.Column(f"coverage of {100 * evaluation.metrics.LEVEL:g} %", (METRICS["coverage"],)),
-)
+COLUMNS = {
+    "visual skill": "visual_skill",
+    "tactile skill": "tactile_skill",
+    "position on pad (mm)": "position_on_pad",
+    "balanced accuracy": "outcome_balanced_accuracy",
+    "log loss (nats)": "outcome_log_loss",
+    "calibration error": "outcome_calibration_error",
+    "ROC area of falling off": "fell_off_auc",
+}
+SAMPLE_COLUMNS = {  # columns of the table of the samples
+    f"visual skill, best of {NUM_SAMPLES}": "visual_skill_best",
+    "sharpness": "sharpness",
+    "energy score (mm)": "energy",
+    f"coverage of {100 * evaluation.metrics.LEVEL:g} %": "coverage",
+}
 DRAWS = 200  # number of times that outcomes are drawn from the probabilities
 
 
@@ -70,6 +69,12 @@ def collection(args: Args) -> dataset.Collection:
     )
 
 
+def columns(names: dict[str, str]) -> list[evaluation.Column]:
+    """Columns of metrics by their heading."""
+    metrics = {metric.name: metric for metric in evaluation.METRICS}
+    return [evaluation.Column(heading, (metrics[name],)) for heading, name in names.items()]
+
+
 def if_calibrated(confidence: np.ndarray, *, draws: int = DRAWS, seed: int = 0) -> float:
     """Compute the mean calibration error that chance alone causes if the predicted probabilities are correct."""
     drawn = np.random.default_rng(seed).random((draws, len(confidence))) < confidence
@@ -79,10 +84,7 @@ def if_calibrated(confidence: np.ndarray, *, draws: int = DRAWS, seed: int = 0) 
 def main(args: Args) -> str:
     """Test a model on new trajectories, and return a table of the main metrics and a table for sampled predictions."""
     if args.objects < 5:
-        raise ValueError(
-            f"--objects must be at least 5, got {args.objects}. A fifth of the objects is for the baselines, and they "
-            "need at least one object"
-        )
+        raise ValueError(f"--objects must be at least 5, got {args.objects}")
     sts.enable_compilation_cache()
     scenario = EXPERIMENTS[args.model].COLLECTION.scenario
     predictor = _predictor(args, scenario)
@@ -121,9 +123,9 @@ def main(args: Args) -> str:
     summary = evaluation.summarise(scores, test, outcomes=scenario.outcomes)
     measured = "the shipped model" if args.trained is None else f"the model in {args.trained}"
     title = f"{args.model}: {measured} on new objects (seed {args.seed})"
-    main_table = evaluation.table(summary, title=title, notes=notes, columns=COLUMNS)
+    main_table = evaluation.table(summary, title=title, notes=notes, columns=columns(COLUMNS))
     title = f"{args.model}: {NUM_SAMPLES} samples of each prediction"
-    sample_table = evaluation.table(summary, title=title, rows=[*subsets], columns=SAMPLE_COLUMNS)
+    sample_table = evaluation.table(summary, title=title, rows=[*subsets], columns=columns(SAMPLE_COLUMNS))
     return f"{main_table}\n{sample_table}"
 
 
@@ -132,12 +134,11 @@ def _predictor(args: Args, scenario: physics.Scenario) -> sts.Predictor:
     predictor = sts.Predictor.load(args.trained or args.model)
     config, outcomes, known = predictor.model.config, len(scenario.outcomes), len(scenario.condition_scale)
     if not isinstance(config, statespace.Config):
-        raise ValueError(f"--trained {args.trained} is not a state-space model: give the folder of a state-space model")
+        raise ValueError(f"--trained {args.trained} is not a state-space model")
     if (config.outcomes, config.condition) != (outcomes, known):
         raise ValueError(
-            f"the model in --trained {args.trained} has outcomes={config.outcomes} and condition={config.condition}, "
-            f"but a model of the experiment {args.model} has outcomes={outcomes} and condition={known}: give a model "
-            "that this experiment trained"
+            f"--trained {args.trained} has outcomes={config.outcomes} and condition={config.condition}, but "
+            f"{args.model} has outcomes={outcomes} and condition={known}"
         )
     return predictor
 

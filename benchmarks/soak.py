@@ -3,7 +3,6 @@
     python -m benchmarks.soak                            # 10,000 trajectories per scenario, about 2 hours on two cores
     python -m benchmarks.soak --num 300 --only inclined  # about a minute
     python -m benchmarks.soak --keep FOLDER              # keep finished blocks in a folder, and resume from it
-    python -m benchmarks.soak --first-block 17           # skip blocks 0 to 16, if another machine runs these blocks
 
 A new object is made for every eight trajectories. A trajectory is unsettled if the object is neither at rest nor off
 the pad at the end. Trajectories that `simulate` discarded, because they were not finite or sank deeper than
@@ -23,8 +22,7 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from benchmarks.instruments.blocks import NUM, SCENARIOS, claim
-from benchmarks.instruments.starts import bodies, rigid_of
+from benchmarks.instruments.starts import NUM, SCENARIOS, bodies, claim, rigid_of
 from sts_jax import geometry, objects, physics, storage
 from sts_jax.physics.scenario import G
 from sts_jax.physics.simulation import SUNK_LIMIT
@@ -40,13 +38,7 @@ class Args:
     num: int = 10_000  # number of trajectories of each scenario
     # the only scenario to simulate (default: all)
     only: Literal["freefall", "inclined", "perturbed", "released"] | None = None
-    first_block: int = 0  # number of the first block, from 0. Earlier blocks are skipped
     keep: Path | None = None  # folder that keeps finished blocks (default: a temporary folder)
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.first_block * BLOCK < max(self.num, 1):
-            last = max(self.num - 1, 0) // BLOCK
-            raise ValueError(f"--first-block must be from 0 to {last} for --num {self.num}, got {self.first_block}")
 
 
 def excess_energy(
@@ -129,14 +121,13 @@ def main(args: Args, folder: Path) -> None:
     for name in [args.only] if args.only else list(SCENARIOS):
         claim(folder, name, size)
         parts = []
-        for index in tqdm(range(args.first_block, -(-args.num // size)), unit="block", desc=name):
+        for index in tqdm(range(-(-args.num // size)), unit="block", desc=name):
             path = folder / f"{name}-{index:04d}.npz"
             if not path.exists():
                 storage.write_arrays(path, block(name, index, size))
             with np.load(path) as kept:
                 parts.append(dict(kept))
-        wanted = args.num - args.first_block * size
-        found = {field: np.concatenate([part[field] for part in parts])[:wanted] for field in parts[0]}
+        found = {field: np.concatenate([part[field] for part in parts])[: args.num] for field in parts[0]}
         print(report(name, found), flush=True)
 
 

@@ -9,18 +9,17 @@ them through OpenCV, with the light off. All values are medians, and all process
 
 import dataclasses
 import os
-import statistics
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 
-import jax
 import numpy as np
 import tyro
 
 import sts_jax as sts
-from sts_jax.hardware import Lens, twin
+from benchmarks.instruments.timing import median_seconds
+from experiments.shared.device import TwinConfig, make_twin
+from sts_jax.hardware import twin
 from sts_jax.hardware.twin import photometry
 
 SIZES = ((480, 640), (1232, 1640))  # height and width, pixels
@@ -50,26 +49,18 @@ class Args:
 
 def timed(call: Callable[[], object], number: int) -> float:
     """Median time of `number` calls (ms)."""
-    times = []
-    for _ in range(number):
-        start = time.perf_counter()
-        call()
-        times.append(1e3 * (time.perf_counter() - start))
-    return statistics.median(times)
+    return 1e3 * median_seconds(call, repeats=number)[0]
 
 
-def held(size: tuple[int, int], exposure_s: float) -> tuple[twin.Twin, twin.ObjectScene]:
-    """Make a digital twin of the sensor and a scene for it. The object in the scene has the shape of a photo camera."""
-    sensor = sts.Sensor()
-    scene = twin.ObjectScene(sts.objects.make(jax.random.key(0), "camera"), sensor=sensor, resolution=size)
-    warp = twin.lens_warp(Lens.ideal(size[1], size[0]), sensor.camera, size)
-    device = twin.Twin(scene, rate=RATE, imperfections=twin.Imperfections(exposure_s=exposure_s), warp=warp)
-    return device, scene
+def held(size: tuple[int, int]) -> twin.Twin:
+    """Make a twin, whose pad is empty until it receives the command `hold`."""
+    imperfections = twin.Imperfections(exposure_s=1 / RATE)
+    return make_twin(TwinConfig(resolution=size, rate=RATE, imperfections=imperfections), prepare=False)
 
 
 def served(size: tuple[int, int], number: int) -> float:
     """Rate at which a second process receives frames of the digital twin over HTTP (frames/s)."""
-    device, _ = held(size, 1 / RATE)
+    device = held(size)
     device.scene.prepare("hold", device.blender)
     with device, twin.Served(device) as server:
         device.command("hold")
@@ -86,13 +77,13 @@ def main(args: Args) -> None:
     core = min(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {core})
     for size in SIZES:
-        device, scene = held(size, 1 / RATE)
+        device = held(size)
         with device:
+            scene = device.scene
             device.command("hold")
             blender, seen = device.blender, scene.at(device.now_s)
             frame = blender.frame(scene.ends(seen, blender), 0.5)
             poses = iter([seen._replace(frame=i) for i in range(1, 8)])
-            scene.ends(next(poses), blender)
             render = timed(lambda: scene.ends(next(poses), blender), 5)  # noqa: B023
             blend = timed(lambda: blender.frame(scene.ends(seen, blender), 0.5), args.frames)  # noqa: B023
             jpeg = timed(lambda: photometry.encode(frame, 92), args.frames)  # noqa: B023

@@ -8,8 +8,11 @@ from pathlib import Path
 import pytest
 import tyro
 
+import sts_jax
+from benchmarks import device, faults, gap, hidden, shipped
+
 ROOT = Path(__file__).parent.parent
-SOURCES = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("benchmarks/**/*.py")]
+SOURCES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/**/*.md"), *ROOT.glob("benchmarks/**/*.py")]
 COMMAND = re.compile(r'python -m benchmarks\.(\w+)([^`"#\n]*)')
 FURTHER = re.compile(r"^\| `\.\.\. ([^`]*)`", re.MULTILINE)  # options of the command in a row above
 NAMES = [path.stem for path in ROOT.glob("benchmarks/*.py") if path.stem != "__init__"]
@@ -40,3 +43,27 @@ def test_documented_command_is_valid(name, options):
 @pytest.mark.parametrize("name", NAMES)
 def test_every_command_is_documented(name):
     assert f"python -m benchmarks.{name}" in (ROOT / "docs" / "benchmarks.md").read_text()
+
+
+PERTURBED = Path(sts_jax.__file__).parent / "models" / "perturbed"
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: device.Args(pairs=2), "--lags-ms must have 1 to --pairs values, got 5"),
+        (lambda: faults.Args(number=0), "--number must be at least 1, got 0"),
+        (lambda: faults.Args(only=("rain",)), r"unknown kinds \['rain'\]"),
+        (lambda: gap.main(gap.Args(trajectories=9)), "--trajectories must be >= 10, got 9"),
+        (lambda: gap.main(gap.Args(resolution=(64, 64))), "must have the aspect ratio"),
+        (lambda: hidden.Args(soaked=Path("a"), objects=200), "--soaked provides the trajectories"),
+        (lambda: hidden.Args(parts=("fill",), scenario="inclined"), "--scenario inclined has no part fill"),
+        (lambda: shipped.main(shipped.Args("perturbed", objects=4)), "--objects must be at least 5, got 4"),
+        (lambda: shipped.main(shipped.Args("freefall", trained=PERTURBED)), "perturbed has outcomes=4 and condition=3"),
+    ],
+)
+def test_bad_options_are_refused(call, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=message):
+        call()
+    assert not list(tmp_path.iterdir())

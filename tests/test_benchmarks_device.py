@@ -21,8 +21,3 @@ def test_pairs_have_no_wrong_light():
     assert found.pairs == 20
     assert found.wrong == 0
     assert found.frames >= 40
-
-
-def test_fewer_pairs_than_lags_are_refused():
-    with pytest.raises(ValueError, match=r"--lags-ms must be at least 1 and at most --pairs \(2\), got 5"):
-        device.Args(pairs=2)

@@ -70,9 +70,3 @@ def test_short_fit_beats_the_background_on_held_out_presses(recorded, near):
     assert presses.psnr(after, some.color) > presses.psnr(before, some.color) + 0.3
     drawn = presses.draw(constants, lights, other)
     assert presses.psnr(drawn, other.color) > presses.psnr(other.background, other.color) + 5
-
-
-def test_read_without_the_package_names_the_command_that_installs_it(monkeypatch):
-    monkeypatch.setattr(presses.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(FileNotFoundError, match="bench"):
-        presses.read()

@@ -361,8 +361,6 @@ class SeenLights(MotionJpeg):
         self.numbered = True  # True: frames show their number
         self.moving = False  # True: a black disc moves through the frames
         self.spot: tuple[int, int, int] | None = None  # column, row and radius of a dark object (pixels)
-        self.noise = 0.0  # standard deviation of the noise of each pixel (of 255)
-        self._random = np.random.default_rng(0)
         super().__init__(fps=fps, size=size)
 
     def _frame(self) -> bytes:
@@ -381,8 +379,6 @@ class SeenLights(MotionJpeg):
         spot = self.spot
         if spot is not None:
             cv2.circle(image, spot[:2], spot[2], (30, 30, 30), -1)
-        if self.noise:
-            image = np.clip(image + self._random.normal(0, self.noise, image.shape), 0, 255).astype(np.uint8)
         return jpeg(image)
 
     def exposure_of(self, image: Image) -> Exposure | None:

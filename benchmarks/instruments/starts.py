@@ -1,8 +1,8 @@
 """Functions that make objects, simulate their trajectories, and render the first frames of the trajectories."""
 
 import concurrent.futures
+import json
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,7 +13,16 @@ from jaxtyping import PRNGKeyArray
 from tqdm import tqdm
 
 from sts_jax import dataset, objects, physics, storage
+from sts_jax.physics.simulation import SUNK_LIMIT
 from sts_jax.sensor import Sensor
+
+SCENARIOS: dict[str, physics.Scenario] = {
+    "freefall": physics.Freefall(),
+    "inclined": physics.Inclined(),
+    "perturbed": physics.Perturbed(),
+    "released": physics.Released(),
+}
+NUM = 8  # trajectories of each object
 
 # Mass, centre of mass and inertia of one body for several fills, shell scales and directions of the contents.
 rigid = jax.jit(jax.vmap(objects.rigid, in_axes=(None, 0, 0, 0)))
@@ -110,13 +119,21 @@ def draw(items: list[objects.Body], starts: Starts) -> tuple[np.ndarray, np.ndar
     return np.concatenate(visual), np.concatenate(tactile)
 
 
-def kept(folder: Path | None, name: str, make: Callable[[], Starts]) -> Starts:
-    """Load the initial states of trajectories from a file. If there is no file, make the states and write the file."""
-    path = None if folder is None else folder / f"{name}.npz"
-    if path is not None and path.exists():
-        with np.load(path) as file:
-            return Starts(**{field: file[field] for field in Starts._fields})
-    starts = make()
-    if path is not None:
-        storage.write_arrays(path, starts._asdict())
-    return starts
+def claim(folder: Path, name: str, size: int) -> None:
+    """Write a JSON file with the simulation settings of a scenario, such as the number of trajectories per object."""
+    settings = {"scenario": repr(SCENARIOS[name]), "num": NUM, "block": size, "sunk_limit": SUNK_LIMIT}
+    storage.claim(folder / f"{name}.json", settings)
+
+
+def soaked(folder: Path, name: str) -> Starts:
+    """Load the initial states and outcomes of a scenario's trajectories, which a run with `--keep` stored."""
+    claimed, paths = folder / f"{name}.json", sorted(folder.glob(f"{name}-????.npz"))
+    if not (claimed.exists() and paths):
+        raise FileNotFoundError(f"{folder} has no trajectories of {name}: run benchmarks.soak --keep {folder}")
+    claim(folder, name, json.loads(claimed.read_text())["block"])
+    parts = []
+    for path in paths:
+        with np.load(path) as kept:
+            known = {field: kept[field] for field in Starts._fields if field != "rerolled"}
+            parts.append(Starts(**known, rerolled=np.full(len(kept["body"]), -1)))
+    return Starts(*map(np.concatenate, zip(*parts, strict=True)))

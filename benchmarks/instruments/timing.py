@@ -26,6 +26,11 @@ def fresh(function: str, *arguments: Any, cache: Path | None = None) -> Any:
     return json.loads(done.stdout.splitlines()[-1])
 
 
+def median_seconds(*calls: Callable[[], object], repeats: int = 7) -> list[float]:
+    """Median seconds of each function, see `in_turn`."""
+    return np.median(in_turn(*calls, repeats=repeats), axis=0).tolist()
+
+
 def in_turn(*calls: Callable[[], object], repeats: int = 5) -> np.ndarray:
     """Measure the durations of functions in alternation, so that a busy machine slows all of them alike."""
     seconds = np.empty((repeats + 1, len(calls)))

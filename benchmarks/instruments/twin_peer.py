@@ -4,20 +4,17 @@ The twin logs the brightness of its LEDs during each frame. A benchmark can ther
 off in an image, independently of `hardware.STS`.
 """
 
-import math
 import zlib
 from pathlib import Path
 
-import jax
 import numpy as np
 from jaxtyping import UInt8
 
-import sts_jax as sts
 from benchmarks.instruments.peers import Shown
-from sts_jax.hardware import Lens, twin
+from experiments.shared.device import TwinConfig, make_twin
+from sts_jax.hardware import twin
 from sts_jax.hardware.twin import photometry
 
-FIELD_OF_VIEW = math.radians(160)  # rad, field of view of the lens across the diagonal
 _START = b"\xff\xd8\xff"  # first bytes of a JPEG image
 
 
@@ -26,23 +23,11 @@ class TwinPeer:
 
     def __init__(self, path: Path, *, fps: float, lag_s: float, exposure_s: float, size: tuple[int, int]) -> None:
         """Render the first images, and start the camera and the controller."""
-        width, height = size
-        sensor = sts.Sensor()
-        scene = twin.ObjectScene(
-            sts.objects.make(jax.random.key(0), "camera"), sensor=sensor, resolution=(height, width)
-        )
-        lens = Lens.ideal(width, height, field_of_view=FIELD_OF_VIEW, distance=float(sensor.camera.distance))
         self._log, self._record = path.with_suffix(".jsonl"), path.with_suffix(".mjpeg")
-        self.twin = twin.Twin(
-            scene,
-            rate=fps,
-            imperfections=twin.Imperfections(exposure_s=exposure_s, lag_s=lag_s),
-            warp=twin.lens_warp(lens, sensor.camera, (height, width)),
-            log=self._log,
-            record=self._record,
+        imperfections = twin.Imperfections(exposure_s=exposure_s, lag_s=lag_s)
+        self.twin = make_twin(
+            TwinConfig(size[::-1], rate=fps, imperfections=imperfections, log=self._log, record=self._record)
         )
-        for command in ("clear", "hold"):
-            scene.prepare(command, self.twin.blender)
         self._served = twin.Served(self.twin, link=path)
         self.url = self._served.camera
 
