@@ -76,7 +76,7 @@ class VirtualSensor:
             clock=device,
         )
         height, width, _ = twin.capture()[1].shape
-        self.origin = Origin(CAMERA, twin.serial_number, width, height, self.levels)  # for `hardware.Session.open`
+        self.origin = Origin(CAMERA, twin.serial_number, width, height, self.levels)  # for `hardware.Session`
         if settling is None:
             self.settling = self._frames.measure_settling(_SWITCHES, _WATCH_S)
         else:
