@@ -22,9 +22,9 @@ from sts_jax import hardware
 
 def find(config: Config) -> str:
     """List the cameras and USB serial ports among which the user must choose, and the command to run next."""
-    sensors, lines, words = hardware.find_sensors(), [], ["python", "-m", "experiments.commission"]
-    ports = [port for port in sensors.ports if port.vendor is not None]
-    cameras = {camera.source: str(camera) for camera in sensors.cameras}
+    lines, words = [], ["python", "-m", "experiments.commission"]
+    ports = [port for port in hardware.find_controllers() if port.vendor is not None]
+    cameras = {camera.source: str(camera) for camera in hardware.find_cameras()}
     controllers = {p.device: f"{p.device} ({p.description}, serial number {p.serial_number})" for p in ports}
     for option, given, kind, there, remedy in (
         ("--camera", config.camera, "camera", cameras, "connect one, or give the URL of one"),

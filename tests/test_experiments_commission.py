@@ -409,9 +409,10 @@ def test_each_stream_of_a_device_has_its_exposure(peer, config, monkeypatch, cap
 
 
 def test_devices_are_listed_with_the_next_command(config, monkeypatch, capsys):
-    camera = hardware.FoundCamera("/dev/v4l/by-id/usb-A-index0", "/dev/video0", "A")
+    camera = hardware.FoundCamera("/dev/v4l/by-id/usb-A-index0", "A")
     ports = [hardware.Port("/dev/ttyACM0", "Uno", "55", 1, 1), hardware.Port("/dev/ttyS0", "n/a", None, None, None)]
-    monkeypatch.setattr(hardware, "find_sensors", lambda: hardware.FoundSensors([camera], ports))
+    monkeypatch.setattr(hardware, "find_cameras", lambda: [camera])
+    monkeypatch.setattr(hardware, "find_controllers", lambda: ports)
     commission.main(dataclasses.replace(config, camera=None, leds=None))
     lines = capsys.readouterr().out.splitlines()
     assert lines[:4] == [
@@ -421,7 +422,7 @@ def test_devices_are_listed_with_the_next_command(config, monkeypatch, capsys):
         "  /dev/ttyACM0 (Uno, serial number 55)",
     ]
     assert "--camera /dev/v4l/by-id/usb-A-index0 --leds /dev/ttyACM0 --out" in lines[4]
-    monkeypatch.setattr(hardware, "find_sensors", lambda: hardware.FoundSensors([camera], []))
+    monkeypatch.setattr(hardware, "find_controllers", lambda: [])
     with pytest.raises(ValueError, match="no USB serial port was found: connect the controller"):
         commission.main(dataclasses.replace(config, leds=None))
 

@@ -128,7 +128,7 @@ def device(config: Collect) -> tuple[hardware.STS, EmptyPad | None]:
     if config.sensor is not None:
         return commissioned(config, config.sensor)
     if config.camera is None or config.leds is None:
-        cameras, ports = hardware.find_sensors()
+        cameras, ports = hardware.find_cameras(), hardware.find_controllers()
         raise ValueError(
             f"{'--camera' if config.camera is None else '--leds'} is missing. Cameras found: "
             f"{', '.join(str(camera) for camera in cameras) or 'none'}. Serial ports found: "

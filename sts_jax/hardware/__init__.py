@@ -60,7 +60,7 @@ from sts_jax.hardware.session import (
     recorded_images,
     restore_recording,
 )
-from sts_jax.hardware.sts import STS, Exposed, FoundSensors, brightness, choose_exposure, find_sensors
+from sts_jax.hardware.sts import STS, Exposed, brightness, choose_exposure
 
 __all__ = [
     "STS",
@@ -83,7 +83,6 @@ __all__ = [
     "Exposed",
     "FoundCamera",
     "FoundCorners",
-    "FoundSensors",
     "FrameSizeError",
     "FrozenCameraError",
     "GuideConfig",
@@ -128,7 +127,6 @@ __all__ = [
     "find_board",
     "find_cameras",
     "find_controllers",
-    "find_sensors",
     "fit_lens",
     "known_pad",
     "list_recordings",

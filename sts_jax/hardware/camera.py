@@ -238,7 +238,6 @@ class FoundCamera:
     """A camera that `find_cameras` has found."""
 
     source: str  # most stable path of the camera, which `CameraConfig` accepts as its source
-    device: str  # path that `source` points to, such as /dev/video0
     name: str  # name that the driver gives the camera
 
     def __str__(self) -> str:
@@ -266,7 +265,7 @@ def find_cameras(root: Path = Path("/")) -> list[FoundCamera]:
         properties = root / "sys/class/video4linux" / device.name
         if _text(properties / "index") in ("", "0"):  # the others deliver a camera's metadata
             source = links.get(device.resolve(), device)
-            cameras.append(FoundCamera(str(source), str(device), _text(properties / "name") or "unnamed"))
+            cameras.append(FoundCamera(str(source), _text(properties / "name") or "unnamed"))
     return cameras
 
 

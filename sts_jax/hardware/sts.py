@@ -13,8 +13,8 @@ from jaxtyping import UInt8
 
 from sts_jax.hardware import leds as leds_module
 from sts_jax.hardware import protocol
-from sts_jax.hardware.camera import Camera, CameraConfig, CameraError, FoundCamera, find_cameras
-from sts_jax.hardware.leds import Leds, Port, find_controllers
+from sts_jax.hardware.camera import Camera, CameraConfig, CameraError
+from sts_jax.hardware.leds import Leds
 from sts_jax.hardware.opencv import OpenCVCamera
 from sts_jax.hardware.proof import Pair, ProvenFrames, Settling, Shot, Stream, thumbnail
 from sts_jax.hardware.sensor_file import Device
@@ -31,18 +31,6 @@ _TOLERANCE = 25.0  # largest difference from the wanted brightness, of 255
 _DARKER = 0.4  # factor on the exposure of a saturated image, whose true brightness is unknown
 _MOST = 4.0  # largest factor on the exposure in one attempt
 _ATTEMPTS = 10
-
-
-class FoundSensors(NamedTuple):
-    """The cameras and the serial ports of this machine. An `STS` needs one of each."""
-
-    cameras: list[FoundCamera]
-    ports: list[Port]  # serial ports to which an LED controller may be connected
-
-
-def find_sensors() -> FoundSensors:
-    """List the cameras and serial ports of this machine. No serial port is opened."""
-    return FoundSensors(find_cameras(), find_controllers())
 
 
 class STS:
