@@ -114,17 +114,8 @@ def slope(
     """The loss of the moved object's image, and its derivatives.
 
     The depth and the tilt of the moved object balance the forces in the gel. The derivatives treat them as constant,
-    because the pad has the same properties at every position.
-
-    Args:
-        sensor: Constants of the sensor.
-        body: The object.
-        pose: Pose before the move, shape (7,).
-        wrench: Wrench on the object before the move, shape (6,).
-        at: Shift in x and y (m) and turn (rad), shape (3,).
-        target: Tactile image to which the pose is fitted, shape (height, width, 3).
-        blur: Standard deviation of the Gaussian blur (m).
-        resolution: (height, width) of the image (pixels).
+    because the pad has the same properties at every position. `pose` (7,) and `wrench` (6,) are those before the move,
+    `at` (3,) is the shift (m) and turn (rad), and `blur` is the standard deviation of a Gaussian (m).
     """
     frame = sts.sense(sensor, body, moved(pose, at), carried(wrench, pose, at), resolution=resolution)
     pitch = frame.window[2:] / jnp.array([resolution[1], resolution[0]])
@@ -142,12 +133,8 @@ def slope(
 def descend(look: Callable[[np.ndarray, float], Slope], start: np.ndarray) -> list[tuple[np.ndarray, Slope]]:
     """Minimise the loss by Levenberg-Marquardt steps, first with the strongest blur and last with the weakest.
 
-    Args:
-        look: Function of (x, y, yaw) and the blur (m) that returns the loss and its derivatives, as `slope` does.
-        start: Initial x (m), y (m) and yaw (rad).
-
-    Returns:
-        The accepted points (x, y, yaw) with the results of `look`. The last point of a blur is the first of the next.
+    `look` maps (x, y, yaw) and the blur (m) to the loss and its derivatives, as `slope` does. Returns the accepted points
+    with the results of `look`. The last point of a blur is the first of the next.
     """
     path, at = [], start
     for blur in BLURS:

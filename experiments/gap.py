@@ -114,10 +114,7 @@ def centred(image: np.ndarray, resolution: tuple[int, int]) -> np.ndarray:
 
 
 def load(config: Config) -> tuple[Side, Side]:
-    """Read the real and the simulated images.
-
-    With `--match number`, both have the same trajectory numbers. With `--match none`, they have none in common.
-    """
+    """Read both sides. With `--match number`, they have the same trajectory numbers, otherwise none in common."""
     is_dataset = (config.simulated / "collection.json").exists()
     if is_dataset and config.match == "number":
         raise ValueError(f"{config.simulated} is a dataset, whose numbers match no real ones: give --match none")

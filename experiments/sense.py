@@ -68,10 +68,7 @@ def look(config: Config, sensor: sts.Sensor, body: sts.objects.Body) -> tuple[st
 
 
 def panels(frame: sts.Frame, between: np.ndarray, light: float) -> list[tuple[str, np.ndarray]]:
-    """The captions and images in [0, 1] of a frame, and of the image with the LEDs at `light` times full power.
-
-    In the depth image, near points are bright. The pressure image has the resolution of the gel's grid.
-    """
+    """The captions and images in [0, 1] of a frame, and of the image with the LEDs at `light` times full power."""
     seen = np.asarray(frame.segmentation)
     depth = np.where(seen, np.asarray(frame.depth), np.nan)
     near, far = (np.nanmin(depth), np.nanmax(depth)) if seen.any() else (0.0, 1.0)

@@ -35,11 +35,7 @@ class Args:
 
 
 def ship(workdir: Path, name: str) -> str:
-    """Copy the trained model of a work directory to `sts_jax/models/NAME`, with rounded weights.
-
-    Returns:
-        A line with the size of the copy, and the differences between predictions of the original and of the copy.
-    """
+    """Copy a trained model to `sts_jax/models/NAME`, with rounded weights, and describe the copy in one line."""
     if not name.isidentifier():
         raise ValueError(f"--name must be letters, digits and underscores, without a digit first, got {name!r}")
     original = sts.Predictor.load(workdir / "models" / "statespace")

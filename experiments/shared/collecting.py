@@ -22,11 +22,7 @@ PANEL = 200  # width of an image on the sheet (pixels)
 
 @dataclasses.dataclass(frozen=True)
 class Collect:
-    """Guide a person through trajectories, and save the images of each trajectory.
-
-    A trajectory has a visual and a tactile image of the held object, and a visual and a tactile image of the object at
-    rest.
-    """
+    """Guide a person through trajectories, and save images of the held object, and of the object at rest."""
 
     workdir: Folder = Path("runs/real")  # work directory. The trajectories go to its folder `dataset`
     camera: str | None = None  # path or URL of the camera, or a video file. None: the camera of the sensor file
@@ -235,13 +231,7 @@ def check(folder: Path) -> None:
 
 
 def draw(folder: Path, numbers: tuple[int, ...], path: Path) -> None:
-    """Draw trajectories as rows of four images: initial visual and tactile, final visual and tactile.
-
-    Args:
-        folder: Folder of the session.
-        numbers: Numbers of the trajectories. Empty: the newest `SHEET`.
-        path: Path of the picture.
-    """
+    """Draw trajectories, the newest `SHEET` if there are no numbers, as rows: initial and final visual and tactile."""
     recordings = hardware.load_recordings(folder)
     if unknown := set(numbers) - set(recordings.numbers):
         raise ValueError(

@@ -82,11 +82,7 @@ def check(config: Config) -> None:
 
 
 def commission(config: Config) -> None:
-    """Measure the camera, the lights and the lens of a sensor, and write the sensor file.
-
-    Args:
-        config: Options of the command line, with `camera` and `leds`.
-    """
+    """Measure the camera, the lights and the lens of a sensor, and write the sensor file."""
     check(config)
     simulated, size = sts.Sensor(), (config.width, config.height)
     lens: hardware.Lens | None = None
@@ -151,11 +147,7 @@ def say(text: str) -> None:
 
 
 def wait(text: str, every: float | None) -> str:
-    """Show an instruction, and wait `every` seconds, or for the Enter key.
-
-    Returns:
-        The text that was typed before Enter, in lower case.
-    """
+    """Show an instruction, wait `every` seconds or for the Enter key, and return what was typed, in lower case."""
     if every is not None:
         say(f"{text} Continues in {every:g} s.")
         time.sleep(every)
@@ -206,12 +198,7 @@ def claim_pictures(config: Config, camera: hardware.OpenCVCamera) -> None:
 
 
 def expose(config: Config, camera: hardware.OpenCVCamera, leds: hardware.Leds) -> tuple[float, float] | None:
-    """Choose the exposure of each stream. The lights are off afterwards.
-
-    Returns:
-        The exposures of the visual and the tactile stream in the driver's unit, or None if this program cannot set the
-        camera's exposure.
-    """
+    """Choose the exposures of both streams in the driver's unit, or None if the camera's exposure cannot be set."""
     now, rate = camera.locked.get("exposure"), camera.statistics.rate
     assert rate is not None
     settable = now is not None and now > 0 and camera.set_exposure(now) is not None
@@ -317,11 +304,7 @@ class Pictures:
         )
 
     def fit(self, pinhole: sts.optics.Camera) -> hardware.Lens:
-        """Calibrate the lens, check that the lens and the pictures cover the view of the sensor, and print the errors.
-
-        Raises:
-            CalibrationError: The pictures do not determine the lens, or the lens or the pictures do not cover the view.
-        """
+        """Calibrate the lens, check that lens and pictures cover the view of the sensor, and print the errors."""
         names = sorted(self.corners)
         say(f"board: {len(names)} pictures in {self.folder}, {self.describe()}")
         try:
@@ -346,11 +329,7 @@ class Pictures:
 
 
 def take(pictures: Pictures, sensor: hardware.STS, number: int, every: float | None) -> None:
-    """Take pictures until the board was found in `number` of them, or the person typed `done`.
-
-    The picture of the board on the pad, `000.png`, is taken first if it is missing. Each picture in which the board was
-    found is written immediately, and the others are discarded.
-    """
+    """Take pictures, the one on the pad first, until the board was found in `number` of them, or `done` was typed."""
     kept = pictures.corners
     while len(kept) < number:
         enough, lay = len(kept) >= FEWEST_IMAGES, _FIRST not in kept

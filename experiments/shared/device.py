@@ -68,13 +68,7 @@ class TwinConfig:
 
 
 def make_twin(config: TwinConfig, *, first: int = 0, prepare: bool = True) -> twin.Twin:
-    """Make a twin.
-
-    Args:
-        config: Options of the command line.
-        first: Number of the first trajectory. The motion of a trajectory depends only on its number and the seed.
-        prepare: Render the empty pad and the first pose of the object in advance.
-    """
+    """Make a twin that begins with the trajectory number `first`, and prepare its first images."""
     if config.object_class not in sts.objects.CATEGORIES:
         classes = ", ".join(sts.objects.CATEGORIES)
         raise ValueError(f"--class is {config.object_class!r}, but it must be one of {classes}")
@@ -243,8 +237,7 @@ class Hand(twin.Hand):
 def simulate(config: Simulated) -> None:
     """Collect trajectories of a twin until the work directory has `config.count` of them.
 
-    The twin has a fixed sequence of trajectories for each seed. An interrupted collection continues with the largest
-    recorded number plus 1, so that no trajectory is repeated.
+    A twin has a fixed sequence of trajectories for each seed, which an interrupted collection continues.
     """
     dataset = config.workdir / "dataset"
     if (dataset / storage.MANIFEST).exists() and len(hardware.load_recordings(dataset)) >= config.count:
@@ -279,11 +272,7 @@ def started(config: Simulated, first: int) -> Iterator[twin.Twin]:
 
 
 def commissioned(config: Simulated, device: twin.Twin) -> tuple[twin.VirtualSensor, EmptyPad]:
-    """Connect to a twin with the sensor file of the work directory, which is written first if it is missing.
-
-    Returns:
-        The sensor, and the look of its empty pad.
-    """
+    """Connect to a twin with the sensor file of the work directory, which is written first if it is missing."""
     file = config.workdir / hardware.sensor_file.NAME
     if not file.exists():
         _commission(config, device)

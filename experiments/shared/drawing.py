@@ -75,8 +75,7 @@ def draw(
 ) -> list[Path]:
     """Draw the main model's predictions, the calibration of its outcomes, and its sampled positions at rest.
 
-    `scores` and `shown`, the first predictions, have the titles of the tables' rows as keys. `rerolled` are poses at
-    rest of re-rolls of the first held-out trajectories, shape (times, n, 7). The result is the paths of the figures.
+    `rerolled` are poses at rest of re-rolls of the first held-out trajectories, shape (times, n, 7).
     """
     config, name = run.config, run.workdir.name
     drawn, model = [], TITLES[run.main_model]
@@ -141,11 +140,7 @@ def draw_strip(path: Path, collection: dataset.Collection, sensor: sts.Sensor, d
 
 
 def views(body: sts.objects.Body, pose: np.ndarray, gravity: np.ndarray, sensor: sts.Sensor, wall: float) -> np.ndarray:
-    """Render the object and the pad obliquely from above, for each frame of a trajectory.
-
-    The final direction of gravity points down in the pictures. An object that has left the pad is drawn while it moves.
-    `pose` has the shape (frames, 7), `gravity` (frames, 3), the result (frames, height, width, 3) in [0, 1].
-    """
+    """Render the object and the pad obliquely from above, (frames, height, width, 3), with final gravity downwards."""
     size, up = jnp.array(sensor.gel.size), -jnp.asarray(gravity[-1])
     frozen = np.append(False, (pose[1:] == pose[:-1]).all(1)) & np.asarray(sts.physics.fell_off(jnp.asarray(pose)))
     pose = np.where(frozen[:, None], np.array([0, 0, -10, 1, 0, 0, 0], np.float32), pose)

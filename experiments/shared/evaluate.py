@@ -26,13 +26,7 @@ Judge = Callable[[evaluation.Predicted, dataset.Pairs], evaluation.Scores]
 
 
 def stale(folder: Path, part: str, inputs: Mapping[str, str]) -> str | None:
-    """Why a part of the results of a folder must be computed again, or None if it is up to date.
-
-    Args:
-        folder: Folder of the results, with the manifest that `record` writes.
-        part: Name of the part, such as "evaluation".
-        inputs: Current checksum of each input, by name.
-    """
+    """Why a part of the results of a folder must be computed again, given the checksums of its inputs, or None."""
     try:
         manifest = storage.read_manifest(folder, "it will be written again")
         if manifest is None or part not in manifest.facts:
@@ -48,14 +42,7 @@ def stale(folder: Path, part: str, inputs: Mapping[str, str]) -> str | None:
 
 
 def record(folder: Path, part: str, inputs: Mapping[str, str], files: Sequence[Path]) -> None:
-    """Add the inputs and the files of a part of the results to the manifest of a folder, after all files are written.
-
-    Args:
-        folder: Folder of the results.
-        part: Name of the part.
-        inputs: Checksum of each input, by name.
-        files: Files of the part, in the folder or below it.
-    """
+    """Add the inputs and the files of a part of the results to the manifest of a folder. Call it after writing them."""
     try:
         before = storage.read_manifest(folder, "")
     except storage.DamagedFileError:
@@ -76,8 +63,7 @@ def identity(model: Path) -> str:
 class SplitPairs(NamedTuple):
     """The first and last frames of the parts of a split.
 
-    The images of `validation` and `given` have the resolution of the models' inputs. The images of `train` and `test`
-    have the resolution `config.image_size`, in which predictions are scored.
+    `validation` and `given` have the resolution of the models' inputs, `train` and `test` have `config.image_size`.
     """
 
     train: dataset.Pairs  # training trajectories
@@ -89,13 +75,7 @@ class SplitPairs(NamedTuple):
 def evaluate(run: Run, data: dataset.Dataset, own: Extensions = NONE) -> str:
     """Score every model on held-out trajectories, write the results, and return the main table in Markdown.
 
-    The results are `metrics.json`, `table.md`, `table-full.md` and `figures/`. `manifest.json` records the checksums of
-    their inputs and of themselves. While all of them match, nothing is evaluated again.
-
-    Args:
-        run: The split of the experiment, with trained models.
-        data: Dataset of the experiment.
-        own: Your own metrics, columns and modalities.
+    While the checksums of all inputs and results match those in `manifest.json`, nothing is evaluated again.
     """
     config, workdir, scenario = run.config, run.workdir, run.config.collection.scenario
     part, inputs = f"evaluation by {run.split}", _inputs(run, data, own)
@@ -204,12 +184,7 @@ def _scored(
 
 
 def main_rows(model: str, titles: Sequence[str]) -> list[str]:
-    """Titles of the main table's rows: the ceiling, the baselines, and up to five rows of the main model.
-
-    Args:
-        model: Title of the main model.
-        titles: Titles of the rows of all models.
-    """
+    """Titles of the main table's rows: the ceiling, the baselines, and up to five rows of the main model."""
     wanted = [f"{model}, from {given}" for given in MAIN_SUBSETS]
     return [evaluation.CEILING, *evaluation.BASELINES, *[title for title in wanted if title in titles][:5]]
 
@@ -247,15 +222,7 @@ class Ceilings(NamedTuple):
 def ceilings(
     run: Run, data: dataset.Dataset, test: dataset.Pairs, judge: Judge, metrics: Sequence[evaluation.Metric]
 ) -> Ceilings:
-    """Read the re-rolls of the first held-out trajectories from `ceiling.npz`, or simulate them and write this file.
-
-    Args:
-        run: The split of the experiment.
-        data: Dataset of the experiment.
-        test: Held-out trajectories, as targets.
-        judge: Function that scores a prediction (`evaluation.scorer`).
-        metrics: Metrics that `judge` computes. Their source code is not compared.
-    """
+    """Read the re-rolls of the first held-out trajectories from `ceiling.npz`, or simulate them and write this file."""
     config, workdir = run.config, run.workdir
     part, path = f"ceiling by {run.split}", workdir / f"ceiling{run.suffix}.npz"
     few = test.take(slice(config.num_rerolled))
@@ -284,15 +251,7 @@ def reroll(
     judge: Judge,
     progress: Callable[[int], object] | None = None,
 ) -> Ceilings:
-    """Re-roll trajectories, and score two predictions of each: the mean of its re-rolls, and one of its re-rolls.
-
-    Args:
-        run: The split of the experiment.
-        test: Trajectories to re-roll.
-        times: Number of re-rolls of each trajectory.
-        judge: Function that scores a prediction of the trajectories in `test`.
-        progress: Function that receives the total number of re-rolls that have been simulated so far.
-    """
+    """Re-roll trajectories, and score two predictions of each: the mean of its re-rolls, and one of its re-rolls."""
     mean = evaluation.ceiling(run.config.collection, run.sensor, test, times, jax.random.key(SEED), progress=progress)
     samples = mean.samples
     assert samples is not None

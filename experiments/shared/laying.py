@@ -91,11 +91,7 @@ def read(config: Config, name: str) -> sts.objects.Body:
 
 
 def lay(config: Config, sensor: sts.Sensor, body: sts.objects.Body) -> tuple[np.ndarray, np.ndarray, str]:
-    """Place the object at rest (`physics.place`), then tilt, turn and move it as the options require.
-
-    Returns:
-        Its pose (7,), the wrench of the pad on it (6,), and a description of how it rests.
-    """
+    """Place the object at rest, then tilt, turn and move it: its pose (7,), the wrench (6,) and a description."""
     shares = sts.physics.stable_faces(body, fill=FILL).share
     if not 0 <= config.rest < len(shares):
         raise ValueError(f"--rest is {config.rest}, but it must be the index of a face, from 0 to {len(shares) - 1}")

@@ -84,10 +84,7 @@ class Views:
         return hardware.SensorView(*(image.astype(np.float32) / 255 for image in rectified))
 
     def prepared(self, visual: Image, tactile: Image, empty: Mapping[str, np.ndarray]) -> hardware.SensorView:
-        """Convert raw images to the inputs of a model whose empty sensor looks like `empty` (`Predictor.empty`).
-
-        Unless `divided` is False, `hardware.relit` adapts brightness and colours to the sensor of the model's training.
-        """
+        """Convert raw images to the inputs of a model whose empty sensor looks like `empty` (`Predictor.empty`)."""
         model = hardware.SensorView(**empty)
         rows, columns = model.visual.shape[:2]
         view = self.rectified((visual, tactile), (rows, columns))
@@ -113,13 +110,9 @@ class Live:
         condition: tuple[float, ...],
         show: Callable[[], None],
     ):
-        """Compile the model, which takes about half a minute the first time on a machine, and start the thread.
+        """Compile the model, and start the thread, which calls `show` after each prediction.
 
-        Args:
-            predictor: Trained model with visual images among its inputs.
-            views: Conversion from raw images to the view of the sensor.
-            condition: Condition of the model (SI units). Empty: zeros.
-            show: Function that the thread calls after each prediction. The latency includes this call.
+        The first compilation on a machine takes half a minute. An empty `condition` stands for zeros.
         """
         if "visual" not in predictor.modalities:
             raise ValueError(f"--model must take visual images as inputs: give another one than {predictor!r}")
@@ -145,10 +138,7 @@ class Live:
         self._thread.start()
 
     def offer(self, visual: hardware.Shot, tactile: hardware.Shot) -> None:
-        """Pass the newest images to the thread, in place of images that it has not used yet.
-
-        An error of an earlier prediction, which ended the thread, is raised here.
-        """
+        """Pass the newest images to the thread, or raise the error of an earlier prediction, which ended the thread."""
         with self._changed:
             if self._error is not None:
                 raise self._error

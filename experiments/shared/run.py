@@ -113,11 +113,7 @@ def configure(args: Args) -> Config:
 
 
 def with_meshes(collection: dataset.Collection, folder: Path, args: Args) -> dataset.Collection:
-    """Replace the objects of a collection by those of a folder, which are listed in `objects.txt`.
-
-    If the folder has fewer objects than the collection, each object gets more trajectories, so that their total stays
-    about the same.
-    """
+    """Replace the objects of a collection by those of a folder, with about the same number of trajectories in total."""
     classes = dataset.mesh_classes(folder)
     taken = args.classes or tuple(name for name in classes if name in collection.categories) or classes
     others = ", ".join(name for name in classes if name not in taken)
@@ -183,10 +179,7 @@ def claim(config: Config, workdir: Path) -> None:
 
 
 def collect(config: Config, workdir: Path, sensor: sts.Sensor) -> dataset.Dataset:
-    """Claim the work directory for the configuration, simulate and render what is missing, and open the dataset.
-
-    Objects that cannot be simulated are listed in `objects.txt`.
-    """
+    """Simulate and render what is missing of the dataset, and open it. `objects.txt` lists objects left out."""
     claim(config, workdir)
     with Bar() as bar:
         collected = dataset.collect(
@@ -252,11 +245,7 @@ def jobs(
     falls: dataset.Ends | None = None,
     measurements: tuple[dataset.Measurement, ...] = (),
 ) -> Iterator[Job]:
-    """Prepare the trainings of an experiment, one after the other.
-
-    Only the state-space model uses `views` and `falls` (ends of trajectories without images), and only the paper's
-    model `mvae` uses `measurements`.
-    """
+    """Prepare the trainings of an experiment. Only the state-space model uses `views` and `falls`."""
     scenario = config.collection.scenario
     frame = dataset.empty_frame(sensor, config.collection)
     empty = {"visual": frame.visual, "tactile": frame.tactile}

@@ -52,10 +52,7 @@ class Config:
 
 @dataclasses.dataclass(frozen=True)
 class Train:
-    """Train the models of the paper's Table 2 on recorded trajectories, and write the table.
-
-    The models are VAE visual only, VAE tactile only and MVAE without pose.
-    """
+    """Train the models of the paper's Table 2 on recorded trajectories, and write the table."""
 
     # configuration of the preset. Each of its fields is an option
     config: Annotated[Config, tyro.conf.arg(name="")]
@@ -116,10 +113,7 @@ def check(config: Config) -> None:
 
 
 def missing(config: Config, workdir: Path) -> int:
-    """The number of trajectories that the digital twin still has to collect.
-
-    It is 0 if the trajectories come from a device, or from a twin that `python -m experiments.twin` ran.
-    """
+    """The number of trajectories that the digital twin still has to collect, 0 for trajectories of other devices."""
     if not (workdir / "dataset" / storage.MANIFEST).exists():
         return config.count
     recordings = hardware.load_recordings(workdir / "dataset")
@@ -197,16 +191,7 @@ def jobs(config: Config, data: Recorded) -> Iterator[Job]:
 
 
 def augmented(config: Config, images: np.ndarray, empty: np.ndarray) -> np.ndarray:
-    """Add `config.shifts` shifted copies of image pairs, and copies in which the final image replaces the initial one.
-
-    Args:
-        config: Configuration of the experiment.
-        images: Initial and final images, all visual or all tactile, uint8 of shape (n, 2, size, size, 3).
-        empty: Image of the empty pad, uint8 of shape (size, size, 3).
-
-    Returns:
-        The given pairs, followed by the copies, uint8 of shape (samples, 2, size, size, 3).
-    """
+    """Add `config.shifts` shifted copies of image pairs (n, 2, size, size, 3), and copies that begin at rest."""
     random, far = np.random.default_rng(config.seed), config.largest_shift
     parts = [images]
     for _ in range(config.shifts):
@@ -217,14 +202,7 @@ def augmented(config: Config, images: np.ndarray, empty: np.ndarray) -> np.ndarr
 
 
 def evaluate(config: Config, data: Recorded, workdir: Path, folder: Path) -> str:
-    """Score the models on the validation trajectories, write the results, and return the table in Markdown.
-
-    Args:
-        config: Configuration of the experiment.
-        data: Recorded trajectories.
-        workdir: Work directory from which the trajectories were read.
-        folder: Folder with the trained models, which receives `metrics.json`, `table.md`, `figures/` and the manifest.
-    """
+    """Score the models on the validation trajectories, write the results to a folder, and return the table."""
     metrics, table = folder / "metrics.json", folder / "table.md"
     models = {name: folder / "models" / name for name in NAMES}
     inputs = {"config.json": storage.digest(dataclasses.asdict(config)), "dataset": data.identity}
@@ -267,13 +245,9 @@ def predictions(models: Mapping[str, Path], data: Recorded) -> dict[str, Predict
 
 
 def transferred(config: Config, data: Recorded, workdir: Path) -> Predicted | None:
-    """Predict the validation trajectories with the library's model `released`, which knows simulated images only.
+    """Predict with the library's model `released`, which knows simulated images only, if it supports the image size.
 
-    The brightness and the colours of the images are adapted to the model's training images, and those of the
-    predictions back to the recorded images (`hardware.relit`).
-
-    Returns:
-        The predictions at `config.image_size`, or None if the model does not support this size.
+    `hardware.relit` adapts the images to the model's training images, and the predictions back to the recorded images.
     """
     predictor = sts.Predictor.load(SIMULATED)
     side, (height, _) = config.image_size, predictor.preprocessing.resolution

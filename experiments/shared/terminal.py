@@ -67,11 +67,7 @@ class Bar:
 
 @contextlib.contextmanager
 def on_one_line(*, debug: bool = False) -> Iterator[None]:
-    """End the program with the line `error: ...` after an error that the user can correct. Warnings take one line too.
-
-    Args:
-        debug: Leave errors as they are, with their tracebacks.
-    """
+    """End the program with the line `error: ...` after an error that the user can correct, unless `debug` is set."""
     usual, warnings.formatwarning = warnings.formatwarning, _note
     try:
         yield
@@ -97,10 +93,7 @@ def interrupt_on_sigterm() -> None:
 
 
 class Terminal:
-    """A `hardware.Person` at a terminal: an empty line confirms, `d` discards the trajectory, `q` stops.
-
-    The end of the input stops too.
-    """
+    """A `hardware.Person` at a terminal: an empty line confirms, `d` discards, `q` or the end of the input stops."""
 
     def __init__(self, count: int | None = None, *, listens: bool = True):
         """Explain the keys, unless nobody listens to them. `count` is the number of trajectories to reach, if any."""
