@@ -133,8 +133,8 @@ def slope(
 def descend(look: Callable[[np.ndarray, float], Slope], start: np.ndarray) -> list[tuple[np.ndarray, Slope]]:
     """Minimise the loss by Levenberg-Marquardt steps, first with the strongest blur and last with the weakest.
 
-    `look` maps (x, y, yaw) and the blur (m) to the loss and its derivatives, as `slope` does. Returns the accepted points
-    with the results of `look`. The last point of a blur is the first of the next.
+    `look` maps (x, y, yaw) and the blur (m) to the loss and its derivatives, as `slope` does. Returns the accepted
+    points with the results of `look`. The last point of a blur is the first of the next.
     """
     path, at = [], start
     for blur in BLURS:

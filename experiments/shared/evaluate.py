@@ -1,7 +1,7 @@
 """Evaluates every model of an experiment with every subset of its inputs, and records what the results belong to."""
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -150,23 +150,17 @@ def _pairs(run: Run, data: dataset.Dataset, own: Extensions) -> SplitPairs:
     return SplitPairs(train, validation, given, test)
 
 
-def queries(run: Run) -> Iterator[tuple[str, sts.Predictor, tuple[str, ...]]]:
-    """Each model with each scored subset of its inputs: the title of the table's row, the model, and the inputs."""
-    for name in MODELS[run.config.model]:
-        predictor = sts.Predictor.load(run.folder(name))
-        subsets = evaluation.subsets(predictor.modalities, state=run.config.model == "statespace")
-        for given, subset in subsets.items():
-            yield f"{TITLES[name]}, {given}", predictor, subset
-
-
 def _scored(
     run: Run, pairs: SplitPairs, judge: Judge, bar: Bar
 ) -> tuple[dict[str, evaluation.Scores], dict[str, evaluation.Predicted]]:
-    """The scores of all queries, and their first predictions for the figures, by title."""
-    config = run.config
+    """The scores of each model for each subset of its inputs, and the first predictions, by title of the row."""
+    config, state, jobs = run.config, run.config.model == "statespace", []
+    for name in MODELS[config.model]:
+        predictor = sts.Predictor.load(run.folder(name))
+        for given, subset in evaluation.subsets(predictor.modalities, state=state).items():
+            jobs.append((f"{TITLES[name]}, {given}", predictor, subset))
     blank = training.load_blank(run.folder(run.main_model))[0] / 255
     scores, shown = {}, {}
-    jobs = list(queries(run))
     for number, (title, predictor, subset) in enumerate(jobs):
         bar("evaluate", number, len(jobs), title)
         row = evaluation.predict(
@@ -176,7 +170,7 @@ def _scored(
             config.collection.scenario,
             validation=pairs.validation,
             blank=blank,
-            num_samples=config.num_samples if config.model == "statespace" else 0,
+            num_samples=config.num_samples if state else 0,
         )
         scores[title] = judge(row, pairs.test)
         shown[title] = evaluation.first(row, config.num_shown)
