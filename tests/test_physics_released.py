@@ -211,19 +211,6 @@ def test_the_energy_never_rises(bodies, let_go, rigids):
         assert max(energy) < energy[0] + 0.02 * mass * G * 0.03  # 2 % of a fall of 30 mm
 
 
-@pytest.mark.slow
-def test_both_engines_agree(bodies, let_go):
-    found = physics.simulate(jax.random.key(1), bodies, sts.Sensor(), SCENARIO, NUM, chunk=20, engine="mjx")
-    for name in ("pose", "wrench", "velocity", "contact"):  # quaternions are normalised differently
-        np.testing.assert_allclose(getattr(found, name)[:, 0], getattr(let_go, name)[:, 0], atol=1e-6)
-    early = np.linalg.norm(np.asarray(found.pose)[:, 3, :3] - let_go.pose[:, 3, :3], axis=1)
-    assert np.quantile(early, 0.8) < 3e-4
-    for outcome in SCENARIO.outcomes:
-        assert np.mean(np.asarray(found.outcome) == outcome) == pytest.approx(
-            np.mean(let_go.outcome == outcome), abs=0.12
-        )
-
-
 def test_outcomes_follow_from_the_poses():
     first = jnp.array([0.01, 0, 0.05, *Rotation.from_euler("x", 0.4).as_quat(scalar_first=True)])
     cases = {
