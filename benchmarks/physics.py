@@ -39,7 +39,7 @@ import tyro
 from benchmarks.instruments.starts import bodies, rigid_of
 from benchmarks.instruments.timing import fresh, in_turn
 from experiments.shared import drawing
-from sts_jax import dataset, objects, physics, storage
+from sts_jax import dataset, objects, physics
 from sts_jax.dataset.rendering import RENDER_BATCH
 from sts_jax.physics import bodies as physics_bodies
 from sts_jax.physics import contact, scene
@@ -59,6 +59,7 @@ SCENARIOS: dict[str, physics.Scenario] = {
     "perturbed": physics.Perturbed(),
     "inclined": physics.Inclined(),
 }
+OBJECTS = 100  # objects whose compilations are counted
 GPU_BATCH = 4096  # frames rendered at once on a GPU
 TACCEL = 915  # environment steps/s of the simulator Taccel, published for 4,096 environments on an H100
 
@@ -73,13 +74,10 @@ class Args:
     pipeline: int | None = None  # measure physics and rendering of this many drops
     scaling: bool = False  # measure steps per second against the number of worlds
     compile: bool = False  # measure the time of compilation, and count compiled programs
-    count: int = 100  # objects whose compilations are counted
 
     def __post_init__(self) -> None:
-        chosen = [name for name in ("engines", "pipeline", "scaling", "compile") if getattr(self, name)]
-        if len(chosen) > 1:
-            given = " and ".join(f"--{name}" for name in chosen)
-            raise ValueError(f"{given} exclude each other: give only one of them")
+        if sum(map(bool, (self.engines, self.pipeline, self.scaling, self.compile))) > 1:
+            raise ValueError("give only one of --engines, --pipeline, --scaling and --compile")
 
 
 class Speeds(NamedTuple):
@@ -193,50 +191,49 @@ def worlds(count: int, frames: int) -> tuple[Worlds, mjx.Model, mjx.Data]:
 
 
 def scaling(frames: int = 8, chunk: int = 32) -> None:
-    """Measure steps per second against the number of worlds, and write a table and a plot to RESULTS."""
-    gpu = jax.default_backend() != "cpu"
-    counts = [4**k for k in range(9 if gpu else 7)]
-    scenario = physics.Freefall(height=0.002, frames=frames)
+    """Measure steps per second against the number of worlds, and plot it."""
     rows: list[Speeds] = []
-    steps = frames * scenario.steps
-    for count in counts:
-        full, model, data = worlds(count, frames)
-        split = [jax.tree.map(lambda x, i=i: x[i : i + chunk], full) for i in range(0, count, chunk)]
-        traj = physics.simulate(jax.random.key(0), rod(), Sensor(), scenario, min(count, 256))
-        models, states = in_c([rod()], traj, scenario.contact)
-        models, states = [models[i % len(models)] for i in range(count)], np.resize(states, (count, states.shape[1]))
-        own = [mujoco.MjData(models[0]) for _ in range(os.cpu_count() or 1)]
-        on_device = jax.device_put(full)
-
-        def at_once(full: Worlds = on_device, model: mjx.Model = model, data: mjx.Data = data) -> None:
-            jax.block_until_ready(roll_worlds(full, model, data))
-
-        def in_chunks(split: list[Worlds] = split, model: mjx.Model = model, data: mjx.Data = data) -> None:
-            with concurrent.futures.ThreadPoolExecutor(WORKERS) as pool:
-                list(pool.map(lambda part: jax.block_until_ready(roll_worlds(part, model, data)), split))
-
-        def rollout(models: list = models, own: list = own, states: np.ndarray = states) -> None:
-            mujoco.rollout.rollout(models, own, states, nstep=steps, persistent_pool=True)
-
-        seconds = np.median(in_turn(at_once, in_chunks, rollout, repeats=3), axis=0)
-        row = Speeds(count, *(count * steps / seconds).tolist())
+    for count in [4**k for k in range(9 if jax.default_backend() != "cpu" else 7)]:
+        row = speeds(count, frames, chunk)
         rows.append(row)
         print(
             f"{count:6d} worlds: {row.at_once:12,.0f} at once {row.in_chunks:12,.0f} in chunks {row.in_c:12,.0f} C",
             flush=True,
         )
-    write_scaling(rows, jax.devices()[0].device_kind, chunk)
+    draw_scaling(rows, jax.devices()[0].device_kind, chunk)
 
 
-def write_scaling(rows: Sequence[Speeds], device: str, chunk: int) -> None:
-    """Write steps per second against the number of worlds to `scaling.md` and `scaling.png`."""
+def speeds(count: int, frames: int, chunk: int) -> Speeds:
+    """Measure the steps per second of `count` worlds."""
+    scenario = physics.Freefall(height=0.002, frames=frames)
+    full, model, data = worlds(count, frames)
+    split = [jax.tree.map(lambda x, i=i: x[i : i + chunk], full) for i in range(0, count, chunk)]
+    traj = physics.simulate(jax.random.key(0), rod(), Sensor(), scenario, min(count, 256))
+    models, states = in_c([rod()], traj, scenario.contact)
+    models, states = [models[i % len(models)] for i in range(count)], np.resize(states, (count, states.shape[1]))
+    own = [mujoco.MjData(models[0]) for _ in range(os.cpu_count() or 1)]
+    on_device, steps = jax.device_put(full), frames * scenario.steps
+
+    def at_once() -> None:
+        jax.block_until_ready(roll_worlds(on_device, model, data))
+
+    def in_chunks() -> None:
+        with concurrent.futures.ThreadPoolExecutor(WORKERS) as pool:
+            list(pool.map(lambda part: jax.block_until_ready(roll_worlds(part, model, data)), split))
+
+    def rollout() -> None:
+        mujoco.rollout.rollout(models, own, states, nstep=steps, persistent_pool=True)
+
+    seconds = np.median(in_turn(at_once, in_chunks, rollout, repeats=3), axis=0)
+    return Speeds(count, *(count * steps / seconds).tolist())
+
+
+def draw_scaling(rows: Sequence[Speeds], device: str, chunk: int) -> None:
+    """Plot steps per second against the number of worlds in `scaling.png`."""
     from matplotlib.figure import Figure
 
     names = ("MJX, all at once", f"MJX, {chunk} at a time, {WORKERS} threads", f"C MuJoCo, {os.cpu_count()} threads")
-    lines = [f"| worlds | {' | '.join(names)} |", "|---|---|---|---|"]
-    lines += [f"| {' | '.join(f'{number:,.0f}' for number in row)} |" for row in rows]
     title = f"Steps per second, one hull of 32 vertices ({device}, {os.cpu_count()} cores)"
-    storage.write_bytes(RESULTS / "scaling.md", "\n".join([title, "", *lines, ""]).encode())
     figure = Figure(figsize=(5, 3.6), layout="constrained")
     axes = figure.subplots()
     worlds, *speeds = zip(*rows, strict=True)
@@ -308,12 +305,12 @@ def first_call(name: str, count: int) -> dict[str, Any]:
     return {"seconds": first - again, "objects": len(items), "programs": programs}
 
 
-def compilation(count: int = 100) -> None:
+def compilation() -> None:
     """Print the seconds of compilation of each scenario, with an empty and with a filled compilation cache."""
     for name in SCENARIOS:
         with tempfile.TemporaryDirectory() as folder:
             for kind in ("empty cache", "kept cache"):
-                found = fresh("benchmarks.physics.first_call", name, count, cache=Path(folder))
+                found = fresh("benchmarks.physics.first_call", name, OBJECTS, cache=Path(folder))
                 programs = ", ".join(f"{function} {number}" for function, number in found["programs"].items())
                 print(f"{name:9s} {kind:11s} {found['seconds']:5.1f} s before the first step")
                 print(f"{'':9s} programs for {found['objects']} objects: {programs}", flush=True)
@@ -322,7 +319,7 @@ def compilation(count: int = 100) -> None:
 def main(args: Args) -> None:
     """Run the chosen measurement."""
     if args.compile:
-        compilation(args.count)
+        compilation()
     elif args.scaling:
         scaling()
     elif args.engines is not None:

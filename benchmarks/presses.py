@@ -31,7 +31,7 @@ from PIL import Image
 from scipy.optimize import nnls
 
 from experiments.shared import drawing
-from sts_jax import storage, tactile
+from sts_jax import tactile
 
 PITCH = 0.0295e-3  # m per pixel (taxim/calib/gelsight/params.json)
 RADIUS = 2e-3  # m, radius of the ball
@@ -206,32 +206,27 @@ def panel(presses: Presses, index: int, constants: tactile.Phong, leds: tactile.
 
 
 def main() -> None:
-    """Fit the lights, print the peak signal-to-noise ratios, and write `presses.png` and `presses.txt`."""
-    lines: list[str] = []
-
-    def say(line: str) -> None:
-        print(line, flush=True)
-        lines.append(line)
-
+    """Fit the lights, print the peak signal-to-noise ratios, and write `presses.png`."""
     presses = read()
     held = held_out(len(presses.images))
     train, test = pixels(presses, np.flatnonzero(~held), every=8), pixels(presses, np.flatnonzero(held))
-    say(f"fitted: {np.sum(~held)} presses, {len(train.color)} pixels; held out: {np.sum(held)}, {len(test.color)}")
-    say(f"background alone: held out {psnr(test.background, test.color):.1f} dB")
+    print(f"fitted: {np.sum(~held)} presses, {len(train.color)} pixels; held out: {np.sum(held)}, {len(test.color)}")
+    print(f"background alone: held out {psnr(test.background, test.color):.1f} dB")
     for name, near in (("far lights", False), ("near lights", True)):
         began = time.perf_counter()
         constants, lights = fit(train, near=near)
         fitted, unseen = (psnr(draw(constants, lights, part), part.color) for part in (train, test))
         seconds = time.perf_counter() - began
-        say(f"{len(lights.colors)} {name}: fitted {fitted:.1f} dB, held out {unseen:.1f} dB ({seconds:.0f} s)")
+        print(f"{len(lights.colors)} {name}: fitted {fitted:.1f} dB, held out {unseen:.1f} dB ({seconds:.0f} s)")
     assert isinstance(lights, tactile.Leds)
     x, y, z = 1e3 * np.abs(np.asarray(lights.positions)).T
     across, down = 1e3 * PITCH * np.array(presses.background.shape[1::-1]) / 2
-    say(f"near: {np.sum((x < across) & (y < down))} under the picture, {z.min():.1f} to {z.max():.0f} mm below the gel")
-    say(f"fall-off {lights.falloff:.2f}, specular {constants.specular:.3f}, shininess {constants.shininess:.2f}")
+    print(
+        f"near: {np.sum((x < across) & (y < down))} under the picture, {z.min():.1f} to {z.max():.0f} mm below the gel"
+    )
+    print(f"fall-off {lights.falloff:.2f}, specular {constants.specular:.3f}, shininess {constants.shininess:.2f}")
     strip = np.concatenate([panel(presses, int(index), constants, lights) for index in np.flatnonzero(held)], axis=1)
     drawing.write_picture(OUT / "presses.png", Image.fromarray(np.round(255 * strip).astype(np.uint8)))
-    storage.write_bytes(OUT / "presses.txt", ("\n".join(lines) + "\n").encode())
 
 
 if __name__ == "__main__":

@@ -38,6 +38,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 import sts_jax as sts
+from benchmarks.instruments.starts import bodies
 from benchmarks.instruments.timing import fresh, median_seconds
 from benchmarks.instruments.truth import public_meshes
 from experiments.shared.drawing import write_figure
@@ -81,7 +82,7 @@ class Case(NamedTuple):
 
 
 class Durations(NamedTuple):
-    """Median seconds per frame of `sense` and of the ray tracer Embree."""
+    """Median seconds per frame of `sense`, and per depth image of embree for each of the three ways."""
 
     frame: float  # a whole frame
     gel: float  # balance of the gel alone
@@ -89,8 +90,8 @@ class Durations(NamedTuple):
     visual: float  # gel, depth and visual stream
     tactile: float  # gel, depth and tactile stream
     at_once: float  # a whole frame in as many threads as there are cores, or in a batch
-    embree: np.ndarray  # depth by embree in one thread, for each of the three ways
-    embree_at_once: np.ndarray  # depth by embree in as many threads as there are cores
+    embree: np.ndarray  # in one thread
+    embree_at_once: np.ndarray  # in as many threads as there are cores
 
 
 def finer(body: objects.Body, faces: int | None) -> objects.Body:
@@ -310,13 +311,9 @@ def cost() -> None:
 
     def measured(faces: int, shape: tuple[int, int]) -> dict[str, float]:
         found = fresh("benchmarks.sensor.cost_of", faces, *shape)
-        seconds, image = found["seconds"], f"{shape[1]:5}x{shape[0]:<5}"
-        per_pixel = 1e9 * seconds / shape[0] / shape[1]
-        memory = f"{found['bytes'] / 2**30:6.2f} GiB held at most"
-        print(
-            f"{found['faces']:6} faces {image} {1e3 * seconds:8.2f} ms {per_pixel:8.1f} ns a pixel {memory}",
-            flush=True,
-        )
+        seconds, memory = found["seconds"], f"{found['bytes'] / 2**30:6.2f} GiB held at most"
+        image, per_pixel = f"{shape[1]:5}x{shape[0]:<5}", 1e9 * seconds / shape[0] / shape[1]
+        print(f"{found['faces']:6} faces {image} {1e3 * seconds:8.2f} ms {per_pixel:8.1f} ns a pixel {memory}")
         return found
 
     by_size = [(shape, measured(2000, shape)) for shape in COST_SIZES]
@@ -338,20 +335,16 @@ def cost() -> None:
 def compilations(number: int = 100) -> None:
     """Print how often `sense` compiles for `number` different objects: the public meshes and procedural objects."""
     files = sorted(public_meshes().glob("*.obj"))
-    bodies = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # open meshes and missing materials
-        for path in files:
-            bodies.append(objects.load(path, longest_side=0.08, up="y", faces=4096))
-    for index in range(number - len(bodies)):
-        category = objects.CATEGORIES[index % len(objects.CATEGORIES)]
-        bodies.append(objects.make(jax.random.key(index), category))
-    for body in bodies:
+        loaded = [objects.load(path, longest_side=0.08, up="y", faces=4096) for path in files]
+    items = [*loaded, *bodies(objects.CATEGORIES, number - len(loaded))]
+    for body in items:
         poses, wrenches = resting(body, 1)
         sts.sense(sts.Sensor(), body, poses[0], wrenches[0])
     programs: tuple[Any, Any] = (equilibrium.balance, drawing.draw)
     balance, draw = (program._cache_size() for program in programs)
-    print(f"{len(bodies)} objects, {len(files)} of them loaded: the balance compiled {balance} times, drawing {draw}")
+    print(f"{len(items)} objects, {len(files)} of them loaded: the balance compiled {balance} times, drawing {draw}")
 
 
 def main(args: Args) -> None:
