@@ -71,13 +71,11 @@ class Network(nnx.Module):
 
 
 def _fold(x: Float[Array, "n h w c"]) -> Float[Array, "n h/2 w/2 4*c"]:
-    """Move the pixels of each 2x2 block into the channels."""
     n, h, w, c = x.shape
     return x.reshape(n, h // 2, 2, w // 2, 2, c).swapaxes(2, 3).reshape(n, h // 2, w // 2, 4 * c)
 
 
 def _unfold(x: Float[Array, "n h w c"]) -> Float[Array, "n 2*h 2*w c/4"]:
-    """Undo `_fold`."""
     n, h, w, c = x.shape
     return x.reshape(n, h, w, 2, 2, c // 4).swapaxes(2, 3).reshape(n, 2 * h, 2 * w, c // 4)
 

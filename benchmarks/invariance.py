@@ -66,15 +66,15 @@ class MirroredFreefall(physics.Freefall):
     """The scenario `Freefall` with mirrored starts, for objects from `objects.mirror`."""
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-        """Sample an initial state with `Freefall.start` for the unmirrored shape, and reflect this state."""
+        """Sample a start for the unmirrored shape, and reflect it."""
         return mirror(super().start(key, mirror_shape(shape), pad))
 
 
 class MirroredPerturbed(physics.Perturbed):
-    """The scenario `Perturbed` with mirrored poses and pad accelerations, for objects from `objects.mirror`."""
+    """The scenario `Perturbed` with mirrored starts, for objects from `objects.mirror`."""
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-        """Sample an initial state with `Perturbed.start` for the unmirrored shape, and reflect this state."""
+        """Sample a start for the unmirrored shape, and reflect it."""
         return mirror(super().start(key, mirror_shape(shape), pad))
 
 
@@ -238,11 +238,6 @@ def last_in_c(case: Case, traj: physics.Trajectory, *, every_vertex: bool = Fals
     return np.array(ends, np.float32)
 
 
-def named(case: Case, first: Array | np.ndarray, last: Array | np.ndarray) -> np.ndarray:
-    """Label the runs of a case. The label of a run names the state at its end."""
-    return np.asarray(jax.vmap(case.label)(jnp.asarray(first), jnp.asarray(last)))
-
-
 def difference(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
     """Return the 95 % confidence interval of the difference between the shares of one label in two sets of runs."""
     gained, lost, count = np.sum(b & ~a) + 0.5, np.sum(a & ~b) + 0.5, len(a) + 2
@@ -265,15 +260,14 @@ def sides(case: Case, num: int) -> dict[str, np.ndarray]:
         f"{case.name}: {len(first)} runs a side, unsettled {100 * np.mean(~ours.settled):.1f} %, drawn again "
         f"{', '.join(f'{int(traj.resampled.sum())} ({name})' for name, traj in rolled.items())}"
     )
-    found = {
-        **{name: named(case, traj.pose[:, 0], traj.pose[:, -1]) for name, traj in rolled.items()},
-        "C MuJoCo": named(case, first, last_in_c(case, ours)),
-        "C, every vertex": named(case, first, last_in_c(case, ours, every_vertex=True)),
-    }
+    ends = {name: traj.pose[:, -1] for name, traj in rolled.items()}
+    ends["C MuJoCo"] = last_in_c(case, ours)
+    ends["C, every vertex"] = last_in_c(case, ours, every_vertex=True)
     if ours.condition.shape[1]:
-        last = last_in_c(case, ours, every_vertex=True, driven=True)
-        found["C, every vertex, driven pad"] = named(case, first, last)
-    return found
+        ends["C, every vertex, driven pad"] = last_in_c(case, ours, every_vertex=True, driven=True)
+    label = jax.vmap(case.label)
+    starts = {name: traj.pose[:, 0] for name, traj in rolled.items()}
+    return {name: np.asarray(label(starts.get(name, first), last)) for name, last in ends.items()}
 
 
 def compare(found: dict[str, np.ndarray], labels: Sequence[str], margin: float = MARGIN) -> bool:

@@ -12,7 +12,7 @@ import dataclasses
 import itertools
 import time
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple, TypeVar
+from typing import Annotated, Literal, TypeVar
 
 import jax
 import numpy as np
@@ -42,15 +42,6 @@ class Args:
     steps: tuple[int, ...] = (400, 800, 1600)  # gradient steps. A model of each number sees all training objects
     seeds: tuple[int, ...] = (0,)  # seeds of the weights and of the order of the batches
     out: Path = Path("scaling.png")  # file of the plot, which shows the first seed
-
-
-class Point(NamedTuple):
-    """A point of the figure: the inputs of a tested model, the size of its training set, and its training time."""
-
-    inputs: str
-    trajectories: int  # of the training set
-    steps: int
-    minutes: float  # duration of the training
 
 
 def some(part: Part, objects: np.ndarray) -> Part:
@@ -115,7 +106,7 @@ def main(args: Args) -> str:
                 say(title)
                 found = evaluation.predict(predictor, subset, given, scenario, num_samples=config.num_samples)
                 scores[title] = judge(found, test)
-                points[title] = Point(" and ".join(subset), trajectories, steps, round(minutes, 1))
+                points[title] = (" and ".join(subset), trajectories, steps, round(minutes, 1))
     summary = evaluation.summarise(scores, test, outcomes=scenario.outcomes)
     skills = {title: summary["predictors"][title]["visual_skill"] for title in points}
     trained = [
@@ -125,7 +116,7 @@ def main(args: Args) -> str:
     ]
     title = f"{args.workdir.name}: visual skill of the state-space model"
     scaling(args.out, trained, ceiling=best_possible(args.workdir), title=title)
-    notes = [f"{title}: {point.minutes} minutes of training" for title, point in points.items()]
+    notes = [f"{title}: {minutes} minutes of training" for title, (*_, minutes) in points.items()]
     return evaluation.table(summary, title=f"{args.workdir.name}: scaling", rows=list(points), notes=notes)
 
 

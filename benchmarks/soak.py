@@ -36,8 +36,7 @@ class Args:
     """Options of the command line."""
 
     num: int = 10_000  # number of trajectories of each scenario
-    # the only scenario to simulate (default: all)
-    only: Literal["freefall", "inclined", "perturbed", "released"] | None = None
+    only: Literal["freefall", "inclined", "perturbed", "released"] | None = None  # scenario (default: all)
     keep: Path | None = None  # folder that keeps finished blocks (default: a temporary folder)
 
 

@@ -160,15 +160,10 @@ class MotionJpeg:
             image = np.full((height, width, 3), self.colour, np.uint8)
             image[:16, :16] = 60 + self.number % 2 * 100
             return jpeg(image)
-        match self.mode:
-            case "black":
-                return jpeg(np.zeros((height, width, 3), np.uint8))
-            case "small":
-                return jpeg(draw(self.number, (width // 2, height // 2)))
-            case "damaged":
-                data = jpeg(draw(self.number, self.size))
-                return data[: len(data) // 2]
-        return jpeg(draw(self.number, self.size))
+        if self.mode == "black":
+            return jpeg(np.zeros((height, width, 3), np.uint8))
+        data = jpeg(draw(self.number, (width // 2, height // 2) if self.mode == "small" else self.size))
+        return data[: len(data) // 2] if self.mode == "damaged" else data
 
 
 class Peer:
@@ -263,33 +258,26 @@ class Peer:
         with self._lock:
             reply = self.controller.receive(line, self.clock())
         held, self._held = self._held, b""
-        match fault:
-            case "lost":
-                return held
-            case "late":
-                self._held = reply
-                return held
-            case "doubled":
-                return held + reply + reply
-            case "garbled":
-                return held + reply[:4] + bytes([reply[4] ^ 8]) + reply[5:]
-            case "cut":
-                return held + reply[: len(reply) // 2]
-            case "joined":
-                return held + reply[:-1] + reply
-            case "noise":
-                return held + b"\xff\x00\xfe\n" + reply
-            case "watchdog":
-                return held + protocol.encode_reply(protocol.TurnedOff(77)) + reply
-            case "stale":
-                return held + protocol.encode_reply(protocol.State(65535, (9, 9, 9, 9), 9, 9)) + reply
-            case "vanish":
-                self._stop.set()
-                os.close(self._slave)
-                os.close(self._master)
-                self._master = self._slave = -1  # the system may give the old numbers to other files
-                return b""
-        return held + reply
+        if fault == "late":
+            self._held = reply
+        if fault == "vanish":
+            self._stop.set()
+            os.close(self._slave)
+            os.close(self._master)
+            self._master = self._slave = -1  # the system may give the old numbers to other files
+            return b""
+        sent = {
+            "lost": b"",
+            "late": b"",
+            "doubled": reply + reply,
+            "garbled": reply[:4] + bytes([reply[4] ^ 8]) + reply[5:] if len(reply) > 4 else reply,
+            "cut": reply[: len(reply) // 2],
+            "joined": reply[:-1] + reply,
+            "noise": b"\xff\x00\xfe\n" + reply,
+            "watchdog": protocol.encode_reply(protocol.TurnedOff(77)) + reply,
+            "stale": protocol.encode_reply(protocol.State(65535, (9, 9, 9, 9), 9, 9)) + reply,
+        }
+        return held + sent.get(fault, reply)
 
 
 class Lights:
@@ -384,7 +372,7 @@ class SeenLights(MotionJpeg):
     def exposure_of(self, image: Image) -> Exposure | None:
         """Look up an image's exposure by the frame number in its corner."""
         if image.shape[1::-1] != self.size or image.max() < DARK / 2:
-            return None
+            return
         return self.log.get(number_of(image[:CORNER, :CORNER]))
 
 
