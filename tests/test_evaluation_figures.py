@@ -89,13 +89,6 @@ def test_predictions_show_input_truth_mean_and_four_samples_of_both_streams(tmp_
     np.testing.assert_allclose(picture(2, 6), predicted.samples.visual[3, 1] / 255, rtol=1e-6)
 
 
-def test_predictions_without_samples_or_touch_have_fewer_rows_and_columns(tmp_path, drawn):
-    test, predicted = judged()
-    figures.predictions(tmp_path / "a.png", test, predicted._replace(samples=None, tactile=None), num=9, title="t")
-    assert len(drawn[0].axes) == 3 * len(test.object)
-    assert drawn[0].axes[2].get_title() == "prediction"
-
-
 def test_a_calibration_figure_shows_shares_and_counts_of_each_bin(tmp_path, drawn):
     confidence, right = np.array([0.91, 0.95, 0.93, 0.55]), np.array([True, True, False, True])
     by_name = {"deterministic": {}, "from vision": {evaluation.CALIBRATION: np.stack([confidence, right], 1)}}
@@ -146,16 +139,6 @@ def test_a_scaling_figure_joins_models_of_one_number_of_steps_or_of_trajectories
     }
     assert left.get_xticks().tolist() == [100, 800]
     assert right.get_xticks().tolist() == [2.01, 2.08, 5.01, 5.08]
-
-
-def test_a_scaling_figure_has_no_ticks_of_models_that_a_panel_leaves_out(tmp_path, drawn):
-    points = [
-        figures.Trained("vision", *where, 0.3, 0.2, 0.4) for where in ((100, 500, 5.1), (800, 500, 5.2), (800, 90, 1))
-    ]
-    figures.scaling(tmp_path / "a.png", points, title="t")
-    left, right = drawn[0].axes
-    assert left.get_xticks().tolist() == [100, 800]
-    assert right.get_xticks().tolist() == [1, 5.2]
 
 
 @pytest.mark.parametrize(("last", "scale"), [(0.5, "log"), (-3.0, "linear")])
