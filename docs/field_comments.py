@@ -1,4 +1,4 @@
-"""Griffe extension that shows the comment beside a field in the API reference.
+"""Griffe extensions: the comment beside a field is shown in the API reference, and `import b as b` makes `b` public.
 
 The fields of the library's dataclasses and named tuples have comments with their unit, shape and source, on the line of
 the field or in the lines above it.
@@ -27,6 +27,19 @@ class FieldComments(griffe.Extension):
         said = " ".join(part for part in text if part)
         if said:
             attr.docstring = griffe.Docstring(said, lineno=attr.lineno, parent=attr)
+
+
+class PublicImports(griffe.Extension):
+    """Names that a package imports under their own names, `from a import b as b`, are its public ones (PEP 484)."""
+
+    def on_module_members(self, *, mod: griffe.Module, **_: Any) -> None:
+        """Set the public names of a module. Griffe calls this method for each module that it has read."""
+        if mod.exports is None:
+            lines = mod.lines_collection[mod.filepath]
+            names = [name for name, one in mod.members.items() if one.is_alias]
+            mod.exports = [
+                name for name in names if any(line.endswith(f"import {name} as {name}") for line in lines)
+            ] or None
 
 
 def _comment(line: str) -> str:

@@ -5,7 +5,6 @@
     python -m experiments.live --camera URL --leds PORT --sensor bench    # the same sensor under other addresses
     python -m experiments.live --sensor bench --record runs/monday        # also records both streams
     python -m experiments.live --replay runs/monday --loop                # predicts from a recording
-    python -m experiments.live --replay visual.mp4 tactile.mp4 --sensor bench
     python -m experiments.live --headless --seconds 20 --save live.png    # without a page
 
 The command makes about ten predictions a second. The page shows the newest visual and tactile image, the predicted
@@ -48,7 +47,7 @@ class Config:
     sensor: Path | None = None  # sensor file of experiments.commission, or its folder
     camera: str | None = None  # path or URL of the camera. None: the camera of the sensor file
     leds: str | None = None  # serial port of the LED controller. None: found by the serial number in the sensor file
-    replay: tuple[Path, ...] = ()  # play back the folder of a recording, or a visual and a tactile video
+    replay: Path | None = None  # play back the recording in this folder
     twin: bool = False  # use a digital twin. This is the default if no other source is given
 
     # name of a model of the library (released, inclined, freefall or perturbed), or the folder of another model
@@ -91,17 +90,13 @@ def check(config: Config) -> None:
     """Check the options before any work."""
     sources = {
         "--twin": config.twin,
-        "--replay": bool(config.replay),
+        "--replay": config.replay is not None,
         "--camera/--leds": config.camera is not None or config.leds is not None,
     }
     given = [name for name, there in sources.items() if there]
     if len(given) > 1 or (config.twin and config.sensor is not None):
         options = " and ".join(given if len(given) > 1 else ["--twin", "--sensor"])
         raise ValueError(f"{options} exclude each other: choose one source of images")
-    if len(config.replay) > 2:
-        raise ValueError(
-            f"--replay has {len(config.replay)} paths, but it takes one folder, or a visual and a tactile video"
-        )
     if config.sensor is None and (config.camera is None) != (config.leds is None):
         missing = "--camera" if config.camera is None else "--leds"
         raise ValueError(f"{missing} is missing: give both --camera and --leds, or a sensor file with --sensor")
@@ -111,7 +106,7 @@ def check(config: Config) -> None:
         raise ValueError(f"--dwell must be >= 1, got {config.dwell}")
     if config.seconds is not None and not config.seconds > 0:
         raise ValueError(f"--seconds must be > 0, got {config.seconds}")
-    if config.record is not None and config.replay:
+    if config.record is not None and config.replay is not None:
         raise ValueError(
             "--record and --replay exclude each other: leave out one of them. To duplicate a recording, copy its folder"
         )
@@ -122,13 +117,10 @@ def check(config: Config) -> None:
 @contextlib.contextmanager
 def opened(config: Config) -> Iterator[Source]:
     """Open the source that the options select. A digital twin runs until the end of the `with` block."""
-    if config.replay:
-        first, file = config.replay[0], config.sensor
-        path = first if len(config.replay) == 1 else (first, config.replay[1])
-        replay = hardware.Replay(path, speed=config.speed, loop=config.loop)
-        if file is None and replay.device is not None:
-            file = first
-        yield Source(f"a recording in {first.parent if isinstance(path, tuple) else first}", replay, file)
+    if config.replay is not None:
+        replay = hardware.Replay(config.replay, speed=config.speed, loop=config.loop)
+        file = config.replay if config.sensor is None and replay.device is not None else config.sensor
+        yield Source(f"a recording in {config.replay}", replay, file)
     elif config.camera is not None and config.leds is not None and config.sensor is None:
         camera = hardware.CameraConfig(config.camera, None, None)
         yield Source(config.camera, hardware.STS(camera=camera, leds=config.leds), None)
@@ -231,9 +223,7 @@ def follow(config: Config, source: Source, predictor: sts.Predictor, page: LiveP
             sensor.connect()  # the clock starts now
         elif config.record is not None:
             origin = hardware.Origin.of(sensor)
-            recorder = hardware.Recorder(
-                config.record, origin, settling=sensor.settling, encoding=config.encoding, file=source.file
-            )
+            recorder = hardware.Recorder(config.record, origin, encoding=config.encoding, file=source.file)
             stack.callback(recorder.close)
         source.connected()
         started_s, newest = time.monotonic(), dict[str, hardware.Shot]()

@@ -38,15 +38,7 @@ def pair(visual, tactile):
 
 
 def record(workdir, count, *, leds="0123", sensor_file=True, seed=0):
-    """Record trajectories in which a square moves by ten rows. Returns their first places.
-
-    Args:
-        workdir: the work directory.
-        count: number of trajectories.
-        leds: serial number of the LED controller.
-        sensor_file: whether to write `sensor.json` with backgrounds.
-        seed: of places and noise.
-    """
+    """Record trajectories in which a square moves by ten rows, with a sensor file. Returns their first places."""
     random = np.random.default_rng(seed)
     places = random.integers(4, 40, (count, 2))
     workdir.mkdir(exist_ok=True)

@@ -1,4 +1,4 @@
-"""Processes that collect random pairs into a session and print the numbers that are confirmed on disk."""
+"""Processes that collect random pairs into a session, and print the numbers that are confirmed on disk."""
 
 import os
 import sys
@@ -7,12 +7,11 @@ import warnings
 
 import numpy as np
 
-from sts_jax.hardware.leds import Lit
-from sts_jax.hardware.proof import Pair, Shot
-from sts_jax.hardware.session import Origin, Session
+from sts_jax.hardware import Lit, Origin, Pair, Recorder, Session, Shot
 
 SIZE = (48, 64)
 ORIGIN = Origin("camera", "0123", SIZE[1], SIZE[0], (255, 255, 255, 255))
+PERIOD_S = 0.05  # s, between two images of a recording
 
 
 def pair(number, end, size=SIZE):
@@ -20,11 +19,28 @@ def pair(number, end, size=SIZE):
     random = np.random.default_rng([number, end == "final"])
     now = time.monotonic()
 
-    def shot(stream, levels):
+    def taken(stream, levels):
         image = random.integers(0, 256, (*size, 3)).astype(np.uint8)
         return Shot(image, stream, now, 2 * number, 1, Lit(levels, 3, 7, now - 0.2, now - 0.1), now + 0.05)
 
-    return Pair(shot("visual", (0, 0, 0, 0)), shot("tactile", (255, 255, 255, 255)))
+    return Pair(taken("visual", (0, 0, 0, 0)), taken("tactile", (255, 255, 255, 255)))
+
+
+def shot(number, *, boot=7, epoch=0):
+    """The visual (even) or tactile (odd) image of a number: noise, in which any mistake shows."""
+    stream, level = ("tactile", 255) if number % 2 else ("visual", 0)
+    image = np.random.default_rng(number).integers(0, 256, (*SIZE, 3)).astype(np.uint8)
+    time_s = 100 + PERIOD_S * number
+    lit = Lit((level,) * 4, number, boot, time_s - 0.2, time_s - 0.1)
+    return Shot(image, stream, time_s, 3 * number, epoch, lit, time_s + 0.01)
+
+
+def record(folder, numbers):
+    """Record the images of these numbers."""
+    with Recorder(folder, ORIGIN) as recorder:
+        for number in numbers:
+            recorder.add(shot(number))
+            yield number
 
 
 def write(folder):
@@ -33,11 +49,9 @@ def write(folder):
         print("ready", os.getpid(), flush=True)
         while True:
             number = session.begin()
-            before = session.confirmed
             for end in ("initial", "final"):
                 session.save(number, end, pair(number, end))
-            session.confirm(number, note=f"note {number}")
-            assert session.confirmed == before + 1
+            session.confirm(number)
             print(number, flush=True)
 
 

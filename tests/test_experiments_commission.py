@@ -182,7 +182,7 @@ def test_an_interrupted_run_resumes_and_writes_a_file_that_opens_the_sensor(peer
     view = hardware.rectified(device.lens, PINHOLE, pair.tactile.image, (60, 80))
     assert view.min() > 150  # no part of the view is outside of the raw image
 
-    with pytest.raises(hardware.WrongDeviceError, match=r"camera http://127\.0\.0\.1:9/video"):
+    with pytest.raises(ValueError, match=r"camera http://127\.0\.0\.1:9/video"):
         hardware.STS.from_file(config.out, camera="http://127.0.0.1:9/video", leds=peer.path)
     with pytest.raises(hardware.LedError, match="EMULATED was not found"):
         hardware.STS.from_file(config.out).connect()
@@ -208,7 +208,7 @@ def test_another_controller_on_the_port_is_refused(tmp_path, peer):
         commissioned="2026-05-31",
     )
     device.save(tmp_path / "bench", sts.Sensor())
-    with pytest.raises(hardware.WrongDeviceError, match=r"LED controller OTHER, but .* LED controller EMULATED"):
+    with pytest.raises(ValueError, match=r"LED controller OTHER, but .* LED controller EMULATED"):
         hardware.STS.from_file(tmp_path / "bench", leds=peer.path).connect()
     hardware.Leds.connect(peer.path).close()  # the port is free again
 

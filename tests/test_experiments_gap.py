@@ -97,7 +97,7 @@ def test_bad_options_are_refused(folder, tmp_path):
     with pytest.raises(ValueError, match="is a dataset"):
         command.load(config(folder, tmp_path / "made", tmp_path))
     (tmp_path / "sensor.json").write_text("{}")
-    with pytest.raises(hardware.SensorFileError, match="that of a simulated sensor"):
+    with pytest.raises(ValueError, match="that of a simulated sensor"):
         command.load(config(folder, folder, tmp_path, sensor=tmp_path))
 
 

@@ -13,8 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from led_simulator import WAIT_S
-from recording_writer import shot
-from session_writer import ORIGIN, SIZE
+from session_writer import ORIGIN, SIZE, shot
 
 import sts_jax as sts
 from experiments import live
@@ -211,14 +210,13 @@ def test_the_page_shows_a_state_and_only_to_its_own_name():
 @pytest.mark.parametrize(
     ("options", "match"),
     [
-        ({"twin": True, "replay": ("a",)}, "--twin and --replay exclude each other"),
+        ({"twin": True, "replay": "a"}, "--twin and --replay exclude each other"),
         ({"twin": True, "sensor": "a"}, "--twin and --sensor exclude each other"),
         ({"sensor": "none"}, "--sensor is none, but there is no sensor file"),
-        ({"replay": ("a", "b", "c")}, "--replay has 3 paths, but it takes one folder, or a visual and a tactile video"),
         ({"camera": "http://127.0.0.1/"}, "--leds is missing: give both --camera and --leds"),
         ({"seconds": 0.0}, "seconds must be > 0, got 0"),
         ({"dwell": 0}, "dwell must be >= 1, got 0"),
-        ({"replay": ("a",), "record": "b"}, "--record and --replay exclude each other"),
+        ({"replay": "a", "record": "b"}, "--record and --replay exclude each other"),
         ({"save": Path("a.mp4")}, r"a\.mp4 has the suffix '\.mp4', but it must be one of \.png"),
     ],
 )
@@ -237,7 +235,7 @@ def test_a_replay_with_a_model_of_the_library(tmp_path, capsys):
         for number in range(40):
             recorder.add(dataclasses.replace(shot(number), image=spotted(180 if number % 2 else 100)))
     picture = tmp_path / "live.png"
-    config = live.Config(replay=(folder,), headless=True, save=picture, speed=0.5, loop=True, seconds=6.0, debug=True)
+    config = live.Config(replay=folder, headless=True, save=picture, speed=0.5, loop=True, seconds=6.0, debug=True)
     live.main(config)
     printed = capsys.readouterr()
     assert "predictions in 6" in printed.err

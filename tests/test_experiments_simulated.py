@@ -148,6 +148,6 @@ def test_a_work_directory_of_a_device_is_not_continued_by_the_twin(file, tmp_pat
     collecting.keep(file, workdir)
     with (
         twin.Twin(twin.Picture(np.zeros((24, 32, 3)), np.ones((24, 32, 3)))) as device,
-        pytest.raises(hardware.WrongDeviceError, match="LED controller TWIN0"),
+        pytest.raises(ValueError, match="LED controller TWIN0"),
     ):
         commissioned(Simulated(workdir, size=(32, 24)), device)

@@ -46,7 +46,8 @@ def test_trajectories_of_a_device_are_split_by_trajectory_and_read_in_the_order_
     other = table2.read(dataclasses.replace(TINY, seed=1), tmp_path / "work")
     assert other.validation.number.tolist() != data.validation.number.tolist()
     assert other.identity == data.identity
-    hardware.discard_recording(tmp_path / "work" / "dataset", 3)
+    with hardware.Session(tmp_path / "work" / "dataset") as session:
+        session.discard(3)
     assert table2.read(TINY, tmp_path / "work").identity != data.identity
 
 
@@ -146,7 +147,8 @@ def test_the_models_are_trained_judged_and_resumed_on_a_device_without_adding_tr
     assert table2.evaluate(TINY, images, work, work / "table2") in table
     assert identities == {name: evaluate.identity(work / "table2" / "models" / name) for name in table2.NAMES}
 
-    hardware.discard_recording(work / "dataset", 2)
+    with hardware.Session(work / "dataset") as session:
+        session.discard(2)
     with pytest.raises(SystemExit, match=r"table2/config.json was made with trajectories.*choose another folder"):
         real.main(Train(TINY, work))
     real.main(Train(TINY, work, name="second"))

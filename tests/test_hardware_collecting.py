@@ -53,7 +53,7 @@ def sensor(peer):
 
 
 def collect(sensor, folder, person, count):
-    with hardware.Session(folder, hardware.Origin.of(sensor), settling=sensor.settling) as session:
+    with hardware.Session(folder, hardware.Origin.of(sensor)) as session:
         return hardware.collect(sensor, session, person, config=GUIDE, trusted=True, count=count)
 
 
@@ -89,19 +89,6 @@ def test_stopping_in_the_middle_keeps_the_initial_pair(peer, sensor, tmp_path):
     assert collect(sensor, tmp_path / "session", person, None) == 0
     (entry,) = hardware.list_recordings(tmp_path / "session")
     assert (entry.number, entry.standing) == (0, "incomplete")
-
-
-def test_an_interruption_by_the_keyboard_keeps_what_was_confirmed(peer, sensor, tmp_path):
-    person = Playing(Player(peer))
-    person.stop_after = lambda view: len({view.number for view in person.views}) > 1 and view.number is None and _stop()
-
-    def _stop():
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        collect(sensor, tmp_path / "session", person, None)
-    (trajectory,) = hardware.load_recordings(tmp_path / "session")
-    check(trajectory, 0)
 
 
 @pytest.mark.parametrize("fails", ["write_folder", "write_manifest"])

@@ -20,7 +20,7 @@ class Scene:
         self.random = np.random.default_rng(seed)
         self.noise, self.drift, self.spot, self.hand = noise, 0.0, None, None
         self.config, self.time_s, self.ends = config, 0.0, []
-        self.state = state or guide.start(trusted=True)
+        self.state = state or guide.State(trusted=True)
 
     def image(self, level, spots):
         values = np.full((*SIZE, 3), level + self.drift)
@@ -108,18 +108,17 @@ def test_a_moving_hand_delays_the_final_pair_unless_only_touch_is_watched(watche
     assert scene.state.stage is expected
 
 
-def test_an_object_that_is_taken_away_again_is_placed_again():
-    scene = placed(Stage.HOLD)
+@pytest.mark.parametrize(
+    ("held_until", "then", "ends"),
+    [(Stage.HOLD, Stage.PLACE, []), (Stage.RELEASE, Stage.REVIEW, ["initial", "final"])],
+)
+def test_an_object_that_is_taken_away_is_placed_again_and_one_that_falls_off_ends_the_trajectory(
+    held_until, then, ends
+):
+    scene = placed(held_until)
     scene.spot = None
-    scene.until(Stage.PLACE)
-    assert scene.ends == []
-
-
-def test_an_object_that_falls_off_ends_the_trajectory():
-    scene = placed()
-    scene.spot = None
-    scene.until(Stage.REVIEW)
-    assert scene.ends == ["initial", "final"]
+    scene.until(then)
+    assert scene.ends == ends
 
 
 def test_an_object_that_stays_needs_a_confirmation():
@@ -156,7 +155,7 @@ def test_a_speck_is_no_contact_but_an_imprint_within_one_block_is():
 
 
 def test_an_unknown_pad_waits_for_the_person():
-    scene = Scene(state=guide.start())
+    scene = Scene(state=guide.State())
     scene.spot = (60, 60, 12)
     assert all(scene.see() is Stage.CLEAR for _ in range(20))
     assert guide.instruction(CONFIG, scene.state).endswith("Then confirm.")
@@ -168,7 +167,7 @@ def test_an_unknown_pad_waits_for_the_person():
 def test_a_background_shows_an_object_that_was_left():
     scene = Scene()
     empty = guide.known_pad(scene.image(80, []), scene.image(200, []))
-    scene = Scene(seed=1, state=guide.start(empty))
+    scene = Scene(seed=1, state=guide.State(empty=empty))
     scene.spot = (60, 60, 12)
     assert all(scene.see() is Stage.CLEAR for _ in range(20))
     scene.spot = None
@@ -194,11 +193,8 @@ def test_an_interruption_starts_the_rest_anew():
 
 
 def test_discarding_returns_to_the_beginning():
-    scene = placed()
-    scene.state = guide.discard(scene.state)
-    assert scene.state.stage is Stage.CLEAR
-    assert scene.state.initial is None
-    assert guide.discard(scene.state) is scene.state
+    state = guide.discard(placed().state)
+    assert (state.stage, state.initial) == (Stage.CLEAR, None)
 
 
 @pytest.mark.parametrize(
@@ -207,7 +203,7 @@ def test_discarding_returns_to_the_beginning():
         ({"hold_s": 0.0}, "hold_s must be > 0 and finite, got 0.0"),
         ({"rest_s": float("nan")}, "rest_s must be > 0"),
         ({"pairs": 2}, "pairs must be >= 3, got 2"),
-        ({"largest_threshold": 1.0}, "largest_threshold must be at least smallest_change"),
+        ({"largest_threshold": 1.0}, "largest_threshold must be >= smallest_change"),
     ],
 )
 def test_bad_settings_are_refused(changes, message):

@@ -7,11 +7,12 @@ import re
 import jax
 import numpy as np
 import pytest
+from damage import damaged
 from PIL import Image
 
 import sts_jax as sts
 from sts_jax import hardware, storage
-from sts_jax.hardware import Device, Lens, SensorFileError, WrongDeviceError
+from sts_jax.hardware import Device, Lens
 
 LENS = dataclasses.replace(Lens.ideal(64, 48), k=(-0.04, 0.012, -0.007, 0.0012), rotation=(0.01, -0.02, 0.0301))
 DEVICE = Device(
@@ -62,7 +63,7 @@ def test_the_file_is_also_that_of_a_simulated_sensor(tmp_path):
         np.testing.assert_array_equal(read, wrote)
     assert DEVICE.backgrounds(tmp_path / "left.json") is None
     sensor.save(tmp_path / "other" / "sensor.json")
-    with pytest.raises(SensorFileError, match=r"sensor\.json is incomplete or that of a simulated sensor"):
+    with pytest.raises(ValueError, match=r"sensor\.json is incomplete or that of a simulated sensor"):
         Device.load(tmp_path / "other")
 
 
@@ -83,21 +84,14 @@ def test_a_copy_is_complete_and_as_good_as_the_original(folder, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["sensor.json", "background_visual.png", "background_tactile.png", "manifest.json"])
-def test_each_flipped_bit_truncation_and_missing_file_is_named(folder, name):
-    path = folder / name
-    content = path.read_bytes()
-    rng = np.random.default_rng(0)
-    damaged = [content[:size] for size in (0, 10, len(content) - 3)]
-    for place in rng.integers(0, len(content), 40):
-        damaged.append(content[:place] + bytes([content[place] ^ 1 << int(rng.integers(8))]) + content[place + 1 :])
-    for data in damaged:
-        path.write_bytes(data)
+def test_flipped_bits_and_truncated_missing_and_exchanged_files_are_named(folder, tmp_path, name):
+    dataclasses.replace(DEVICE, fps=15.0).save(tmp_path / "other", SENSOR, (NEW, NEW))
+    for kind in damaged(folder / name, tmp_path / "other" / name):
+        named = "background_visual.png|sensor.json" if (name, kind) == ("manifest.json", "exchanged") else name
         for read in (Device.load, DEVICE.backgrounds):
-            with pytest.raises(SensorFileError, match=rf"{name} .*experiments\.commission` again"):
+            with pytest.raises((OSError, ValueError), match=rf"({named}).*experiments\.commission` again"):
                 read(folder)
-    path.unlink()
-    with pytest.raises((SensorFileError, FileNotFoundError), match=name):
-        Device.load(folder)
+    assert Device.load(folder) == DEVICE
 
 
 def test_an_interrupted_first_write_is_noticed_and_repeated(tmp_path, monkeypatch):
@@ -105,7 +99,7 @@ def test_an_interrupted_first_write_is_noticed_and_repeated(tmp_path, monkeypatc
         patch.setattr(storage, "write_manifest", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             DEVICE.save(tmp_path, SENSOR, (DARK, LIT))
-    with pytest.raises(SensorFileError, match="incomplete"):
+    with pytest.raises(ValueError, match="incomplete"):
         Device.load(tmp_path)
     DEVICE.save(tmp_path, SENSOR, (DARK, LIT))
     assert Device.load(tmp_path) == DEVICE
@@ -116,22 +110,19 @@ def test_another_camera_or_controller_is_refused_by_name():
     DEVICE.check_identity()
     DEVICE.check_identity(camera=camera, leds=leds)
     both = rf"describes camera {re.escape(camera)} and LED controller {leds}, but the connected sensor has "
-    with pytest.raises(WrongDeviceError, match=both + r"camera /dev/video3: load"):
+    with pytest.raises(ValueError, match=both + r"camera /dev/video3: load"):
         DEVICE.check_identity(camera="/dev/video3", leds=leds)
-    with pytest.raises(WrongDeviceError, match=both + "camera /dev/video3 and LED controller FFFF"):
+    with pytest.raises(ValueError, match=both + "camera /dev/video3 and LED controller FFFF"):
         DEVICE.check_identity(camera="/dev/video3", leds="FFFF")
 
 
 def test_passwords_of_urls_are_not_kept(tmp_path):
-    device = dataclasses.replace(DEVICE, camera="rtsp://user:secret@camera/live")
-    device.save(tmp_path, SENSOR)
+    dataclasses.replace(DEVICE, camera="rtsp://user:secret@camera/live").save(tmp_path, SENSOR)
     assert "secret" not in (tmp_path / "sensor.json").read_text()
     loaded = Device.load(tmp_path)
-    assert loaded.camera == "rtsp://camera/live"
     loaded.check_identity(camera="rtsp://other:word@camera/live")
-    with pytest.raises(WrongDeviceError) as error:
+    with pytest.raises(ValueError, match=r"camera rtsp://camera/live .* has camera rtsp://elsewhere/live"):
         loaded.check_identity(camera="rtsp://user:secret@elsewhere/live")
-    assert "secret" not in str(error.value)
 
 
 def test_a_missing_field_takes_its_default(folder):
@@ -172,7 +163,7 @@ def test_a_wrong_field_is_named(folder, path, value, message):
             inner[last] = value
 
     edit(folder, change)
-    with pytest.raises(SensorFileError, match=rf"sensor\.json: .*({message}).*experiments\.commission` again"):
+    with pytest.raises(ValueError, match=rf"sensor\.json: .*({message}).*experiments\.commission` again"):
         Device.load(folder)
 
 
@@ -182,7 +173,3 @@ def test_wrong_values_are_not_saved(tmp_path):
     with pytest.raises(ValueError, match=r"device\.fps is -1\.0"):
         dataclasses.replace(DEVICE, fps=-1.0).save(tmp_path, SENSOR)
     assert not (tmp_path / "sensor.json").exists()
-
-
-def test_all_public_names_exist():
-    assert all(hasattr(hardware, name) for name in hardware.__all__)

@@ -13,18 +13,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 import session_writer
+from damage import damaged
 from session_writer import ORIGIN, pair
 
 from sts_jax import hardware, storage
-from sts_jax.hardware import Session, Settling
+from sts_jax.hardware import Session
+
+OTHER = dataclasses.replace(ORIGIN, leds="0124")
+FILES = [
+    "manifest.json",
+    *(f"{e}/{n}" for e in ("initial", "final") for n in ("manifest.json", "visual.png", "tactile.png")),
+]
 
 
 def add(session, *, confirm=True, final=True):
     session.check_ready()
     number = session.begin()
-    session.save(number, "initial", pair(number, "initial"))
-    if final:
-        session.save(number, "final", pair(number, "final"))
+    for end in ("initial", "final") if final else ("initial",):
+        session.save(number, end, pair(number, end))
     if confirm:
         session.confirm(number, f"note {number}")
     return number
@@ -34,9 +40,17 @@ def standings(folder):
     return {entry.number: entry.standing for entry in hardware.list_recordings(folder)}
 
 
+def check(trajectory):
+    """The images are those that were written."""
+    for end in ("initial", "final"):
+        for stream in ("visual", "tactile"):
+            one, two = (getattr(taken, stream) for taken in (getattr(trajectory, end), pair(trajectory.number, end)))
+            np.testing.assert_array_equal(one.image, two.image)
+
+
 def test_reading_returns_what_was_saved(tmp_path):
     saved = {end: pair(0, end) for end in ("initial", "final")}
-    with Session(tmp_path, ORIGIN, settling=Settling(0.1, 0.2)) as session:
+    with Session(tmp_path, ORIGIN) as session:
         assert session.begin() == 0
         for end, taken in saved.items():
             session.save(0, end, taken)
@@ -49,60 +63,62 @@ def test_reading_returns_what_was_saved(tmp_path):
         np.testing.assert_array_equal(one.image, two.image)
         assert dataclasses.replace(one, image=two.image).__dict__ == two.__dict__
     assert (trajectory.number, trajectory.note, len(read), read.origin) == (0, "on its edge", 1, ORIGIN)
-    images = read.images(lambda image: image[::2])
+    seen = []
+    images = read.images(lambda image: image[::2], lambda done, total: seen.append((done, total)))
     np.testing.assert_array_equal(images.tactile[0, 1], saved["final"].tactile.image[::2])
     np.testing.assert_array_equal(images.visual[0, 0], saved["initial"].visual.image[::2])
-    facts = storage.read_manifest(tmp_path / "trajectories/00000/initial", "").facts
-    assert facts["settling"] == {"visual_s": 0.1, "tactile_s": 0.2}
-    assert facts["visual"]["taken"].endswith("+00:00")
+    assert seen == [(1, 1)]
+    (entry,) = hardware.list_recordings(tmp_path)
+    assert entry.taken.endswith("+00:00")
 
 
-def test_resuming_continues_with_the_next_number(tmp_path):
-    for expected in range(3):
+def test_a_session_is_continued_and_its_trajectories_discarded_restored_and_confirmed_later(tmp_path):
+    for expected in range(2):
         with Session(tmp_path, ORIGIN) as session:
             assert session.confirmed == expected
             assert add(session) == expected
     with Session(tmp_path, ORIGIN) as session:
-        session.discard(2)
+        assert [add(session, confirm=False), add(session, confirm=False, final=False)] == [2, 3]
+    before = hardware.load_recordings(tmp_path).identity
+    with Session(tmp_path) as session:
+        session.discard(1)
+        assert session.confirmed == 1
+        assert add(session) == 4  # numbers of discarded trajectories are not used again
+    assert standings(tmp_path) == {0: "confirmed", 1: "discarded", 2: "unconfirmed", 3: "incomplete", 4: "confirmed"}
+    assert hardware.load_recordings(tmp_path).identity != before
+    with Session(tmp_path) as session:
+        session.restore(1)
+        session.discard(4)
         assert session.confirmed == 2
-    with Session(tmp_path, ORIGIN) as session:
-        assert add(session) == 3  # numbers of discarded trajectories are not used again
-    assert standings(tmp_path) == {0: "confirmed", 1: "confirmed", 2: "discarded", 3: "confirmed"}
+        assert hardware.load_recordings(tmp_path).identity == before
+        session.confirm(2, "later")
+    notes = [(trajectory.number, trajectory.note) for trajectory in hardware.load_recordings(tmp_path)]
+    assert notes == [(0, "note 0"), (1, "note 1"), (2, "later")]
 
 
-def test_discarding_and_restoring(tmp_path):
-    with Session(tmp_path, ORIGIN) as session:
-        numbers = [add(session), add(session, confirm=False), add(session, confirm=False, final=False)]
-        session.discard(session.begin())  # nothing of it was saved
-        with pytest.raises(storage.LockedError, match=r"is in use by .*: close what uses the folder"):
-            hardware.discard_recording(tmp_path, 0)
-    assert numbers == [0, 1, 2]
-    hardware.discard_recording(tmp_path, 0)
-    assert standings(tmp_path) == {0: "discarded", 1: "unconfirmed", 2: "incomplete"}
-    with pytest.raises(ValueError, match="no confirmed trajectory"):
-        hardware.load_recordings(tmp_path).images()
-    hardware.restore_recording(tmp_path, 0)
-    hardware.confirm_recording(tmp_path, 1, "later")
-    with pytest.raises(FileNotFoundError, match="it has no final pair"):
-        hardware.confirm_recording(tmp_path, 2)
-    with pytest.raises(FileNotFoundError, match="list the trajectories"):
-        hardware.restore_recording(tmp_path, 7)
-    assert [(trajectory.number, trajectory.note) for trajectory in hardware.load_recordings(tmp_path)] == [
-        (0, "note 0"),
-        (1, "later"),
-    ]
-
-
-def test_a_session_of_another_sensor_and_other_folders_are_refused(tmp_path):
-    with pytest.raises(FileNotFoundError, match="holds no session"):
-        hardware.load_recordings(tmp_path)
-    Session(tmp_path / "session", ORIGIN).close()
-    with pytest.raises(ValueError, match=r"was recorded with leds = '0123', but this sensor has leds = '0124'"):
-        Session(tmp_path / "session", dataclasses.replace(ORIGIN, leds="0124"))
-    Session(tmp_path / "session", ORIGIN).close()  # the lock was released
-    storage.write_manifest(tmp_path, {}, {"shards": 3})
-    with pytest.raises(ValueError, match=r"holds no session .*origin.camera is missing"):
-        hardware.list_recordings(tmp_path)
+@pytest.mark.parametrize(
+    ("call", "error", "match"),
+    [
+        (lambda folder: hardware.load_recordings(folder.parent), FileNotFoundError, "holds no session"),
+        (lambda folder: Session(folder.parent), FileNotFoundError, "holds no session"),
+        (lambda folder: Session(folder, OTHER), ValueError, "recorded with leds = '0123', but this sensor has leds = "),
+        (lambda folder: hardware.load_recordings(folder).images(), ValueError, "no confirmed trajectory"),
+        (lambda folder: Session(folder).confirm(0), FileNotFoundError, "it has no final pair"),
+        (lambda folder: Session(folder).restore(7), FileNotFoundError, "list the trajectories"),
+        (lambda folder: (Session(folder), Session(folder)), storage.LockedError, "is in use by .*: close what uses"),
+        (
+            lambda folder: (storage.write_manifest(folder, {}, {"shards": 3}), Session(folder)),
+            ValueError,
+            r"holds no session .*origin.camera is missing",
+        ),
+    ],
+)
+def test_what_is_no_session_and_what_it_cannot_do_is_named(tmp_path, call, error, match):
+    with Session(tmp_path / "session", ORIGIN) as session:
+        add(session, confirm=False, final=False)
+    with pytest.raises(error, match=match):
+        call(tmp_path / "session")
+    assert not (tmp_path / "manifest.json").exists()
 
 
 @pytest.fixture(scope="module")
@@ -127,38 +143,24 @@ def refused(folder, name):
     assert read[1].number == 1
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "manifest.json",
-        *(f"{end}/{name}" for end in ("initial", "final") for name in ("manifest.json", "visual.png", "tactile.png")),
-    ],
-)
+@pytest.mark.parametrize("name", FILES)
 def test_flipped_bits_and_truncated_missing_and_exchanged_files_are_found(folder, name):
     path, other = (folder / "trajectories" / number / name for number in ("00000", "00001"))
-    data, places = path.read_bytes(), np.random.default_rng(0)
-    for place in (0, len(data) - 2, *places.integers(0, len(data), 20)):
-        path.write_bytes(data[:place] + bytes([data[place] ^ 1 << places.integers(0, 7)]) + data[place + 1 :])
-        refused(folder, name)
-    path.write_bytes(data[:-20])
-    refused(folder, name)
-    path.write_bytes(other.read_bytes())
-    refused(folder, "trajectory 1" if name == "manifest.json" else name)
-    path.unlink()
-    if name != "manifest.json":  # without it, the trajectory is not confirmed
-        refused(folder, name)
-    path.write_bytes(data)
+    for kind in damaged(path, other):
+        if name == "manifest.json" and kind in ("exchanged", "missing"):
+            # The manifest of another trajectory names it. Without a manifest, the trajectory is not confirmed.
+            refused(folder, "trajectory 1") if kind == "exchanged" else None
+        else:
+            refused(folder, name)
     assert len(list(hardware.load_recordings(folder))) == 2
 
 
-def test_a_flipped_bit_in_the_manifest_of_the_session_is_found(folder):
-    path = folder / "manifest.json"
-    data = path.read_bytes()
-    for place in np.random.default_rng(0).integers(0, len(data) - 1, 20):
-        path.write_bytes(data[:place] + bytes([data[place] ^ 2]) + data[place + 1 :])
-        for use in (hardware.load_recordings, hardware.list_recordings, lambda folder: Session(folder, ORIGIN)):
-            with pytest.raises(storage.DamagedFileError, match=r"manifest.json .*restore it from a backup"):
+def test_damage_of_the_manifest_of_the_session_is_found(folder):
+    for kind in damaged(folder / "manifest.json"):
+        for use in (hardware.load_recordings, hardware.list_recordings, Session):
+            with pytest.raises(OSError, match=r"manifest.json (.*restore it from a backup|is missing)") as error:
                 use(folder)
+            assert isinstance(error.value, storage.DamagedFileError) == (kind != "missing")
 
 
 def test_exchanged_pairs_foreign_trajectories_and_damage_before_the_confirmation_are_found(folder, tmp_path):
@@ -167,16 +169,14 @@ def test_exchanged_pairs_foreign_trajectories_and_damage_before_the_confirmation
         (path / one).rename(path / two)
     refused(folder, "initial/.*")
     shutil.rmtree(path)
-    with Session(tmp_path / "other", dataclasses.replace(ORIGIN, leds="0124")) as session:
+    with Session(tmp_path / "other", OTHER) as session:
         add(session)
         add(session, confirm=False)
+        image = tmp_path / "other/trajectories/00001/final/visual.png"
+        image.write_bytes(image.read_bytes()[:-1] + b"x")
+        session.confirm(1)
     shutil.copytree(tmp_path / "other/trajectories/00000", path)
     refused(folder, "another sensor")
-    hardware.discard_recording(folder, 0)
-    assert len(list(hardware.load_recordings(folder))) == 1
-    image = tmp_path / "other/trajectories/00001/final/visual.png"
-    image.write_bytes(image.read_bytes()[:-1] + b"x")
-    hardware.confirm_recording(tmp_path / "other", 1)
     with pytest.raises(storage.DamagedFileError, match=r"final/visual\.png"):
         hardware.load_recordings(tmp_path / "other")[1]
 
@@ -199,7 +199,7 @@ def test_a_full_disk_loses_nothing(small_disk):
             session.save(number, end, pair(number, end))
         session.confirm(number)
         assert session.confirmed == 2
-    np.testing.assert_array_equal(hardware.load_recordings(folder)[1].final.visual.image, pair(1, "final").visual.image)
+    check(hardware.load_recordings(folder)[1])
 
 
 @pytest.mark.parametrize("kills", [3, pytest.param(40, marks=pytest.mark.slow)])
@@ -218,21 +218,17 @@ def test_killing_the_writer_loses_no_confirmed_pair(tmp_path, kills):
             run.stdin.flush()
             first = run.stdout.readline()
             assert first.startswith("ready "), f"{first!r} instead of ready. Exit code {run.poll()}"
-            writer = int(first.split()[1])
             time.sleep(moments.uniform(0, 0.08))
-            os.kill(writer, signal.SIGKILL)
+            os.kill(int(first.split()[1]), signal.SIGKILL)
             while (line := run.stdout.readline()) != "killed\n":
                 reported.add(int(line))
             partial += len(list(tmp_path.glob("trajectories/*/.*.partial")))
     assert kills < 40 or (reported and partial)  # some kills came in the middle of a pair
+    Session(tmp_path, ORIGIN).close()
     read = hardware.load_recordings(tmp_path)
     assert reported <= set(read.numbers)  # nothing that was confirmed is lost
     for trajectory in read:
-        for end in ("initial", "final"):
-            found, made = getattr(trajectory, end), pair(trajectory.number, end)
-            np.testing.assert_array_equal(found.visual.image, made.visual.image)
-            np.testing.assert_array_equal(found.tactile.image, made.tactile.image)
+        check(trajectory)
     for folder_of_pair in tmp_path.glob("trajectories/*/[if]*l"):  # initial and final: no half pair, confirmed or not
         storage.verify(folder_of_pair, storage.read_manifest(folder_of_pair, ""), "")
-    Session(tmp_path, ORIGIN).close()
     assert not list(tmp_path.glob("trajectories/*/.*.partial"))

@@ -1,7 +1,5 @@
 """Views and images of recorded trajectories."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,44 +25,20 @@ def test_a_raw_pair_becomes_the_views_that_it_was_made_from():
     assert np.abs(found.visual - tactile / 255).mean() > 0.008
 
 
-def test_recorded_images_are_in_the_order_of_the_trajectories(tmp_path):
+def test_recorded_images_are_rectified_in_the_order_of_the_trajectories(tmp_path):
     places = record(tmp_path / "work", 3)
-    hardware.discard_recording(tmp_path / "work" / "dataset", 1)
-    seen = []
-    found = hardware.recorded_images(
-        hardware.load_recordings(tmp_path / "work" / "dataset"),
-        LENS,
-        CAMERA,
-        progress=lambda done, total: seen.append((done, total)),
-    )
+    with hardware.Session(tmp_path / "work" / "dataset") as session:
+        session.discard(1)
+    recordings = hardware.load_recordings(tmp_path / "work" / "dataset")
+    found = recordings.images(lambda image: hardware.rectified(LENS, CAMERA, image, (64, 64)))
     assert found.number.tolist() == [0, 2]
     assert found.visual.shape == found.tactile.shape == (2, 2, 64, 64, 3)
-    assert seen == [(1, 2), (2, 2)]
     for images, sign in ((found.visual, -1), (found.tactile, 1)):
-        for own, (row, column) in zip(images, places[[0, 2]], strict=True):
-            for moment, first in zip(own, (row, row + 10), strict=True):
-                change = sign * (moment[..., 0].astype(float) - 170)
-                there = np.argwhere(change > 25)
+        for ends, (row, column) in zip(images, places[[0, 2]], strict=True):
+            for image, first in zip(ends, (row, row + 10), strict=True):
+                change = sign * (image[..., 0].astype(float) - 170)
                 centre = (first + (SQUARE - 1) / 2, column + (SQUARE - 1) / 2)
-                np.testing.assert_allclose(there.mean(0), centre, atol=0.7)
-
-
-def test_the_identity_changes_with_the_confirmed_trajectories(tmp_path):
-    record(tmp_path / "work", 2)
-    folder = tmp_path / "work" / "dataset"
-    before = hardware.load_recordings(folder).identity
-    assert hardware.load_recordings(folder).identity == before
-    hardware.discard_recording(folder, 1)
-    without = hardware.load_recordings(folder).identity
-    hardware.restore_recording(folder, 1)
-    assert hardware.load_recordings(folder).identity == before != without
-
-
-def test_images_of_another_size_than_the_lens_are_refused(tmp_path):
-    record(tmp_path / "work", 1)
-    lens = dataclasses.replace(LENS, width=640, height=480)
-    with pytest.raises(ValueError, match="images of 128x96 pixels, but the lens belongs to images of 640x480"):
-        hardware.recorded_images(hardware.load_recordings(tmp_path / "work" / "dataset"), lens, CAMERA)
+                np.testing.assert_allclose(np.argwhere(change > 25).mean(0), centre, atol=0.7)
 
 
 def test_a_view_is_relit_by_the_ratio_of_the_empty_pads():

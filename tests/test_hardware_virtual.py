@@ -184,7 +184,7 @@ def collected(scene, folder, count, hand=twin.Hand, **options):
     """Collect by the ordinary loop."""
     with twin.Twin(scene, rate=15) as made:
         sensor = twin.VirtualSensor(made)
-        with hardware.Session(folder, sensor.origin, settling=sensor.settling) as session:
+        with hardware.Session(folder, sensor.origin) as session:
             person = hand(made, session, **options)
             hardware.collect(sensor, session, person, config=GUIDE, trusted=True, count=count)
 

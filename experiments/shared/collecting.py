@@ -78,7 +78,7 @@ def collect(config: Collect) -> None:
         say("connecting. Keep the pad empty, and do not move anything in view")
         with sensor:
             origin = hardware.Origin.of(sensor)
-            with hardware.Session(config.workdir / "dataset", origin, settling=sensor.settling) as session:
+            with hardware.Session(config.workdir / "dataset", origin) as session:
                 if config.sensor is not None:
                     keep(config.sensor, config.workdir)
                 say(f"{session.folder} has {session.confirmed} confirmed trajectories. New ones are added")
@@ -197,12 +197,14 @@ def review(config: Review) -> None:
     folder = config.workdir / "dataset"
     if config.sheet is not None:
         drawing.check_picture(config.sheet)
-    for number in config.restore:
-        hardware.restore_recording(folder, number)
-    for number in config.confirm:
-        hardware.confirm_recording(folder, number, config.note)
-    for number in config.discard:
-        hardware.discard_recording(folder, number)
+    if config.restore or config.confirm or config.discard:
+        with hardware.Session(folder) as session:
+            for number in config.restore:
+                session.restore(number)
+            for number in config.confirm:
+                session.confirm(number, config.note)
+            for number in config.discard:
+                session.discard(number)
     if config.check:
         check(folder)
     if config.sheet is not None:

@@ -182,7 +182,7 @@ def check_folder(config: Config, camera: hardware.OpenCVCamera, leds: hardware.L
     """Check that the folder does not contain the sensor file of other devices."""
     try:
         there = hardware.Device.load(config.out)
-    except (OSError, hardware.SensorFileError):
+    except (OSError, ValueError):
         return  # a missing or damaged file is written anew
     if (there.camera, there.leds) != (camera.source, leds.serial_number):
         raise ValueError(

@@ -245,7 +245,7 @@ def simulate(config: Simulated) -> None:
         return
     with started(config, hardware.next_recording(dataset)) as device:
         sensor, empty = commissioned(config, device)
-        with hardware.Session(dataset, sensor.origin, settling=sensor.settling) as session, Bar() as bar:
+        with hardware.Session(dataset, sensor.origin) as session, Bar() as bar:
             say(f"{dataset} has {session.confirmed} confirmed trajectories. New ones are added")
             begun_s = time.monotonic()
             number = hardware.collect(

@@ -131,12 +131,9 @@ def read(config: Config, workdir: Path) -> Recorded:
         )
     size = (config.image_size, config.image_size)
     with Bar() as bar:
-        images = hardware.recorded_images(
-            recordings,
-            device.lens,
-            sensor.camera,
-            size,
-            progress=lambda done, total: bar("read", done, total),
+        images = recordings.images(
+            lambda image: hardware.rectified(device.lens, sensor.camera, image, size),
+            lambda done, total: bar("read", done, total),
         )
     empty = {
         stream: hardware.rectified(device.lens, sensor.camera, image, size)

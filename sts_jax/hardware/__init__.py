@@ -1,144 +1,69 @@
 """The real sensor: camera, LED controller, calibration, recording, and its digital twin `twin`."""
 
-from sts_jax.hardware.calibration import (
-    Board,
-    Calibration,
-    CalibrationError,
-    FoundCorners,
-    board_image,
-    calibrate,
-    check_view,
-    covered,
-    find_board,
-    fit_lens,
-    save_board,
-    view_angle,
-)
-from sts_jax.hardware.camera import (
-    Camera,
-    CameraConfig,
-    CameraError,
-    CameraLostError,
-    CameraTimeoutError,
-    Captured,
-    FoundCamera,
-    FrameSizeError,
-    FrozenCameraError,
-    StaleFrameError,
-    find_cameras,
-)
-from sts_jax.hardware.collecting import Action, AutomaticPerson, PairReader, Person, View, collect
-from sts_jax.hardware.guide import EmptyPad, GuideConfig, Stage, known_pad
-from sts_jax.hardware.leds import DisconnectedError, LedError, Leds, LedTimeoutError, Lit, Port, find_controllers
-from sts_jax.hardware.lens import (
-    Lens,
-    SensorView,
-    distorted,
-    distortion,
-    project,
-    rectification,
-    rectified,
-    relit,
-    sensor_view,
-)
-from sts_jax.hardware.opencv import CameraStatistics, OpenCVCamera
-from sts_jax.hardware.proof import LightError, Pair, Settling, Shot
-from sts_jax.hardware.recording import Recorder, Replay
-from sts_jax.hardware.sensor_file import Device, SensorFileError, WrongDeviceError, copy_sensor
-from sts_jax.hardware.session import (
-    Entry,
-    Origin,
-    RecordedImages,
-    RecordedTrajectory,
-    Recordings,
-    Session,
-    confirm_recording,
-    discard_recording,
-    list_recordings,
-    load_recordings,
-    next_recording,
-    recorded_images,
-    restore_recording,
-)
-from sts_jax.hardware.sts import STS, Exposed, brightness, choose_exposure
-
-__all__ = [
-    "STS",
-    "Action",
-    "AutomaticPerson",
-    "Board",
-    "Calibration",
-    "CalibrationError",
-    "Camera",
-    "CameraConfig",
-    "CameraError",
-    "CameraLostError",
-    "CameraStatistics",
-    "CameraTimeoutError",
-    "Captured",
-    "Device",
-    "DisconnectedError",
-    "EmptyPad",
-    "Entry",
-    "Exposed",
-    "FoundCamera",
-    "FoundCorners",
-    "FrameSizeError",
-    "FrozenCameraError",
-    "GuideConfig",
-    "LedError",
-    "LedTimeoutError",
-    "Leds",
-    "Lens",
-    "LightError",
-    "Lit",
-    "OpenCVCamera",
-    "Origin",
-    "Pair",
-    "PairReader",
-    "Person",
-    "Port",
-    "RecordedImages",
-    "RecordedTrajectory",
-    "Recorder",
-    "Recordings",
-    "Replay",
-    "SensorFileError",
-    "SensorView",
-    "Session",
-    "Settling",
-    "Shot",
-    "Stage",
-    "StaleFrameError",
-    "View",
-    "WrongDeviceError",
-    "board_image",
-    "brightness",
-    "calibrate",
-    "check_view",
-    "choose_exposure",
-    "collect",
-    "confirm_recording",
-    "copy_sensor",
-    "covered",
-    "discard_recording",
-    "distorted",
-    "distortion",
-    "find_board",
-    "find_cameras",
-    "find_controllers",
-    "fit_lens",
-    "known_pad",
-    "list_recordings",
-    "load_recordings",
-    "next_recording",
-    "project",
-    "recorded_images",
-    "rectification",
-    "rectified",
-    "relit",
-    "restore_recording",
-    "save_board",
-    "sensor_view",
-    "view_angle",
-]
+from sts_jax.hardware.calibration import Board as Board
+from sts_jax.hardware.calibration import CalibrationError as CalibrationError
+from sts_jax.hardware.calibration import FoundCorners as FoundCorners
+from sts_jax.hardware.calibration import board_image as board_image
+from sts_jax.hardware.calibration import calibrate as calibrate
+from sts_jax.hardware.calibration import check_view as check_view
+from sts_jax.hardware.calibration import covered as covered
+from sts_jax.hardware.calibration import find_board as find_board
+from sts_jax.hardware.calibration import fit_lens as fit_lens
+from sts_jax.hardware.calibration import save_board as save_board
+from sts_jax.hardware.calibration import view_angle as view_angle
+from sts_jax.hardware.camera import Camera as Camera
+from sts_jax.hardware.camera import CameraConfig as CameraConfig
+from sts_jax.hardware.camera import CameraError as CameraError
+from sts_jax.hardware.camera import CameraLostError as CameraLostError
+from sts_jax.hardware.camera import CameraTimeoutError as CameraTimeoutError
+from sts_jax.hardware.camera import Captured as Captured
+from sts_jax.hardware.camera import FoundCamera as FoundCamera
+from sts_jax.hardware.camera import FrameSizeError as FrameSizeError
+from sts_jax.hardware.camera import FrozenCameraError as FrozenCameraError
+from sts_jax.hardware.camera import StaleFrameError as StaleFrameError
+from sts_jax.hardware.camera import find_cameras as find_cameras
+from sts_jax.hardware.collecting import Action as Action
+from sts_jax.hardware.collecting import AutomaticPerson as AutomaticPerson
+from sts_jax.hardware.collecting import PairReader as PairReader
+from sts_jax.hardware.collecting import Person as Person
+from sts_jax.hardware.collecting import View as View
+from sts_jax.hardware.collecting import collect as collect
+from sts_jax.hardware.guide import EmptyPad as EmptyPad
+from sts_jax.hardware.guide import GuideConfig as GuideConfig
+from sts_jax.hardware.guide import Stage as Stage
+from sts_jax.hardware.guide import known_pad as known_pad
+from sts_jax.hardware.leds import DisconnectedError as DisconnectedError
+from sts_jax.hardware.leds import LedError as LedError
+from sts_jax.hardware.leds import Leds as Leds
+from sts_jax.hardware.leds import LedTimeoutError as LedTimeoutError
+from sts_jax.hardware.leds import Lit as Lit
+from sts_jax.hardware.leds import Port as Port
+from sts_jax.hardware.leds import find_controllers as find_controllers
+from sts_jax.hardware.lens import Lens as Lens
+from sts_jax.hardware.lens import SensorView as SensorView
+from sts_jax.hardware.lens import distorted as distorted
+from sts_jax.hardware.lens import distortion as distortion
+from sts_jax.hardware.lens import project as project
+from sts_jax.hardware.lens import rectification as rectification
+from sts_jax.hardware.lens import rectified as rectified
+from sts_jax.hardware.lens import relit as relit
+from sts_jax.hardware.lens import sensor_view as sensor_view
+from sts_jax.hardware.opencv import OpenCVCamera as OpenCVCamera
+from sts_jax.hardware.proof import LightError as LightError
+from sts_jax.hardware.proof import Pair as Pair
+from sts_jax.hardware.proof import Settling as Settling
+from sts_jax.hardware.proof import Shot as Shot
+from sts_jax.hardware.recording import Recorder as Recorder
+from sts_jax.hardware.recording import Replay as Replay
+from sts_jax.hardware.sensor_file import Device as Device
+from sts_jax.hardware.sensor_file import copy_sensor as copy_sensor
+from sts_jax.hardware.session import Origin as Origin
+from sts_jax.hardware.session import RecordedImages as RecordedImages
+from sts_jax.hardware.session import Recordings as Recordings
+from sts_jax.hardware.session import Session as Session
+from sts_jax.hardware.session import list_recordings as list_recordings
+from sts_jax.hardware.session import load_recordings as load_recordings
+from sts_jax.hardware.session import next_recording as next_recording
+from sts_jax.hardware.sts import STS as STS
+from sts_jax.hardware.sts import brightness as brightness
+from sts_jax.hardware.sts import choose_exposure as choose_exposure

@@ -6,21 +6,11 @@ import time
 from typing import Protocol, runtime_checkable
 
 from sts_jax.hardware import guide
-from sts_jax.hardware.camera import CameraLostError, CameraTimeoutError, FrozenCameraError, StaleFrameError
+from sts_jax.hardware.camera import CameraError
 from sts_jax.hardware.guide import EmptyPad, GuideConfig, Stage
-from sts_jax.hardware.leds import DisconnectedError, LedTimeoutError
+from sts_jax.hardware.leds import LedError
 from sts_jax.hardware.proof import LightError, Pair
 from sts_jax.hardware.session import Session
-
-_PASSING = (
-    CameraLostError,
-    CameraTimeoutError,
-    FrozenCameraError,
-    StaleFrameError,
-    DisconnectedError,
-    LedTimeoutError,
-    LightError,
-)
 
 
 class Action(enum.Enum):
@@ -89,7 +79,7 @@ def collect(
     session: Session,
     person: Person,
     *,
-    config: GuideConfig | None = None,
+    config: GuideConfig = GuideConfig(),
     empty: EmptyPad | None = None,
     trusted: bool = False,
     count: int | None = None,
@@ -102,7 +92,7 @@ def collect(
         sensor: Connected sensor.
         session: Session in which the trajectories are saved. `collect` does not close it.
         person: Interface to the person.
-        config: Thresholds and times of the guide. None: the defaults of `GuideConfig`.
+        config: Thresholds and times of the guide.
         empty: Appearance of the empty pad, from `known_pad`. None: the empty pad is measured at the beginning.
         trusted: True if the pad is certainly empty at the beginning. If False and `empty` is None, the person has to
             confirm that the pad is empty.
@@ -115,103 +105,96 @@ def collect(
     Returns:
         Number of trajectories that were confirmed during this call.
     """
-    return _Collecting(sensor, session, person, config or GuideConfig(), note).run(
-        guide.start(empty, trusted=trusted), count, patience_s
-    )
-
-
-class _Collecting:
-    """The state of `collect` and its loop."""
-
-    def __init__(self, sensor: PairReader, session: Session, person: Person, config: GuideConfig, note: str):
-        self._sensor, self._session, self._person = sensor, session, person
-        self._config, self._note = config, note
-        self._pair: Pair | None = None  # the newest pair
-        self._number: int | None = None  # number of the current trajectory
-        self._ends: dict[guide.End, Pair] = {}  # pairs of the current trajectory
-        self._confirmed = 0  # trajectories that were confirmed in this loop
-
-    def run(self, state: guide.State, count: int | None, patience_s: float) -> int:
-        before = self._session.confirmed
-        failing_since: float | None = None
-        refused: str | None = None  # error of the person's last action
-        while count is None or before + self._confirmed < count:
-            problem = self._not_ready(state)
-            try:
-                pair = self._sensor.read()
-                failing_since = None
-            except _PASSING as error:
-                now = time.monotonic()
-                failing_since = now if failing_since is None else failing_since
-                if now - failing_since > patience_s:
-                    raise
-                state, pair, problem = guide.interrupted(state), None, str(error)
-            if pair is not None:
-                if problem is None:
-                    try:
-                        state = self._observed(state, pair)
-                    except OSError as error:  # the pair could not be saved. The next pair tries again
-                        problem = str(error)
-                self._pair = pair
-            self._person.show(self._view(state, problem or refused))
-            action = self._person.action()
-            if action is Action.STOP:
-                break
-            if action is not None and problem is None:
-                try:
-                    state, refused = self._acted(state, action), None
-                except OSError as error:
-                    refused = str(error)
-        return self._confirmed
-
-    def _not_ready(self, state: guide.State) -> str | None:
-        if state.stage not in (Stage.CLEAR, Stage.PLACE):
-            return None
+    state = guide.State(empty=empty, trusted=trusted)
+    trajectory = _Trajectory(session, note)
+    before, newest = session.confirmed, None
+    failing_since_s: float | None = None
+    refused: str | None = None  # error of the person's last action
+    while count is None or session.confirmed < count:
+        problem = _not_ready(session, state)
         try:
-            self._session.check_ready()
+            pair = sensor.read()
+            failing_since_s = None
+        except (CameraError, LedError, LightError) as error:
+            failing_since_s = failing_since_s or time.monotonic()
+            if time.monotonic() - failing_since_s > patience_s:
+                raise
+            state, problem = guide.interrupted(state), str(error)
+        else:
+            if problem is None:
+                try:
+                    state = trajectory.observed(config, state, newest, pair)
+                except OSError as error:  # the pair could not be saved. The next pair tries again
+                    problem = str(error)
+            newest = pair
+        person.show(
+            View(
+                pair=newest,
+                stage=state.stage,
+                instruction=guide.instruction(config, state),
+                contact=state.contact,
+                still=state.still,
+                number=trajectory.number,
+                confirmed=session.confirmed,
+                problem=problem or refused,
+                initial=trajectory.ends.get("initial"),
+                final=trajectory.ends.get("final"),
+            )
+        )
+        action = person.action()
+        if action is Action.STOP:
+            break
+        if action is not None and problem is None:
+            try:
+                state, refused = trajectory.acted(state, action), None
+            except OSError as error:
+                refused = str(error)
+    return session.confirmed - before
+
+
+def _not_ready(session: Session, state: guide.State) -> str | None:
+    """Why no new trajectory can be started, or None."""
+    if state.stage in (Stage.CLEAR, Stage.PLACE):
+        try:
+            session.check_ready()
         except OSError as error:
             return str(error)
-        return None
+    return None
 
-    def _observed(self, state: guide.State, pair: Pair) -> guide.State:
+
+class _Trajectory:
+    """The trajectory that is being collected."""
+
+    def __init__(self, session: Session, note: str):
+        self._session, self._note = session, note
+        self._forget()
+
+    def _forget(self) -> None:
+        self.number: int | None = None  # None: nothing of it was saved
+        self.ends: dict[guide.End, Pair] = {}
+
+    def observed(self, config: GuideConfig, state: guide.State, previous: Pair | None, pair: Pair) -> guide.State:
         """Advance the guide by a pair, and save the previous pair if it is an initial or a final one."""
         time_s = max(pair.visual.time_s, pair.tactile.time_s)
-        state, end = guide.step(self._config, state, guide.observe(time_s, pair.visual.image, pair.tactile.image))
+        state, end = guide.step(config, state, guide.observe(time_s, pair.visual.image, pair.tactile.image))
         if end is not None:
-            assert self._pair is not None  # the guide needs several pairs before it reports one to save
-            if self._number is None:
-                self._number = self._session.begin()
-            self._session.save(self._number, end, self._pair)
-            self._ends[end] = self._pair
+            assert previous is not None  # the guide needs several pairs before it reports one to save
+            if self.number is None:
+                self.number = self._session.begin()
+            self._session.save(self.number, end, previous)
+            self.ends[end] = previous
         elif state.stage in (Stage.CLEAR, Stage.PLACE):
             self._forget()
         return state
 
-    def _acted(self, state: guide.State, action: Action) -> guide.State:
-        if action is Action.CONFIRM:
-            if state.stage is Stage.REVIEW and self._number is not None:
-                self._session.confirm(self._number, self._note)
-                self._confirmed += 1
-                self._forget()
-            return guide.confirm(state)
-        if self._number is not None:
-            self._session.discard(self._number)
+    def acted(self, state: guide.State, action: Action) -> guide.State:
+        """Advance the guide by an action of the person, and confirm or discard the trajectory."""
+        if action is Action.DISCARD:
+            if self.ends and self.number is not None:
+                self._session.discard(self.number)
             self._forget()
-        return guide.discard(state)
-
-    def _forget(self) -> None:
-        self._number, self._ends = None, {}
-
-    def _view(self, state: guide.State, problem: str | None) -> View:
-        return View(
-            pair=self._pair,
-            stage=state.stage,
-            instruction=guide.instruction(self._config, state),
-            contact=state.contact,
-            still=state.still,
-            number=self._number,
-            confirmed=self._session.confirmed,
-            problem=problem,
-            initial=self._ends.get("initial"),
-            final=self._ends.get("final"),
-        )
+            return guide.discard(state)
+        if state.stage is Stage.REVIEW and self.number is not None:
+            self._session.confirm(self.number, self._note)
+            self._forget()
+        return guide.confirm(state)

@@ -39,6 +39,30 @@ class Stage(enum.Enum):
     REVIEW = "review"  # confirm or discard the trajectory
 
 
+# The instruction of each stage, and the hint that is added if the stage takes long.
+_WORDS = {
+    Stage.CLEAR: (
+        "Take everything off the pad and out of view.",
+        "If the pad is empty, confirm, and it is measured again.",
+    ),
+    Stage.PLACE: (
+        "Place the object on the pad in an unstable pose, and keep holding it.",
+        "If the object lies on the pad, press it harder. The tactile image shows no contact yet.",
+    ),
+    Stage.HOLD: ("Hold the object still.", "The image still changes. Rest your hand on the edge of the pad."),
+    Stage.RELEASE: (
+        "Release the object, and take your hand out of view.",
+        "If the object stays where it was, confirm.",
+    ),
+    Stage.STILL: (
+        "Wait until nothing moves.",
+        "The image still changes. Check that nobody is in view and that the room's light is steady.",
+    ),
+    Stage.REVIEW: ("Confirm or discard this trajectory.", ""),
+}
+_CONFIRMED = {Stage.RELEASE: Stage.STILL, Stage.REVIEW: Stage.CLEAR}  # the stage after the person has confirmed
+
+
 @dataclasses.dataclass(frozen=True)
 class GuideConfig:
     """Thresholds and times of the guide."""
@@ -55,15 +79,14 @@ class GuideConfig:
     hint_s: float = 10.0  # time in the same stage after which a hint is shown (s)
 
     def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if field.name != "watched" and not (value > 0 and math.isfinite(value)):
-                raise ValueError(f"{field.name} must be > 0 and finite, got {value}")
+        for name, value in dataclasses.asdict(self).items():
+            if name != "watched" and not (value > 0 and math.isfinite(value)):
+                raise ValueError(f"{name} must be > 0 and finite, got {value}")
         if self.pairs < 3:  # the pair that is saved needs a pair before it and a pair after it
             raise ValueError(f"pairs must be >= 3, got {self.pairs}")
         if self.largest_threshold < self.smallest_change:
             raise ValueError(
-                f"largest_threshold must be at least smallest_change ({self.smallest_change:g}), got "
+                f"largest_threshold must be >= smallest_change = {self.smallest_change:g}, got "
                 f"{self.largest_threshold:g}"
             )
 
@@ -86,12 +109,12 @@ class EmptyPad(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class State:
-    """The state of the guide, from `start`."""
+    """The state of the guide. The default is the first one."""
 
     stage: Stage = Stage.CLEAR
     since_s: float | None = None  # time of the first observation in this stage (s), None: there was none
     now_s: float | None = None  # time of the last observation (s), None: there was none
-    empty: EmptyPad | None = None  # the empty pad, None: not known yet
+    empty: EmptyPad | None = None  # the empty pad, None: not known yet, and measured when `trusted`
     trusted: bool = False  # in the stage CLEAR: the person or the program has stated that the pad is empty
     contact: bool = False  # the last tactile image shows a contact
     still: bool = False  # nothing has moved between the first observation of the window and the last one
@@ -127,17 +150,6 @@ def known_pad(visual: Image, tactile: Image) -> EmptyPad:
     return EmptyPad(seen, Observation(0.0, *map(np.zeros_like, seen[1:])))
 
 
-def start(empty: EmptyPad | None = None, *, trusted: bool = False) -> State:
-    """Make the first state of the guide.
-
-    Args:
-        empty: Appearance of the empty pad. None: not known yet.
-        trusted: True if the pad is certainly empty now. If False and `empty` is None, the guide stays in the first
-            stage until `confirm` is called.
-    """
-    return State(empty=empty, trusted=trusted)
-
-
 def step(config: GuideConfig, state: State, observation: Observation) -> tuple[State, End | None]:
     """Advance the guide by one pair of images.
 
@@ -156,9 +168,12 @@ def step(config: GuideConfig, state: State, observation: Observation) -> tuple[S
         window=window,
         count=1 if moved else state.count + 1,
     )
+    looks_empty = state.trusted or (state.empty is not None and not state.contact)
     match state.stage:
-        case Stage.CLEAR:
-            return _clear(config, state), None
+        case Stage.CLEAR if looks_empty and _rested(config, state, config.empty_s):
+            # The empty pad is measured again for each trajectory, to follow slow changes of the light.
+            empty = empty_pad(state.window)
+            return dataclasses.replace(_enter(state, Stage.PLACE), empty=empty, trusted=False), None
         case Stage.PLACE if state.contact:
             return _enter(state, Stage.HOLD), None
         case Stage.HOLD if not state.contact:
@@ -172,25 +187,11 @@ def step(config: GuideConfig, state: State, observation: Observation) -> tuple[S
     return state, None
 
 
-def _clear(config: GuideConfig, state: State) -> State:
-    """Advance the stage `CLEAR`. It measures the empty pad again each time, to follow slow changes of the light."""
-    if state.empty is None and not state.trusted:
-        return state
-    if (state.contact and not state.trusted) or not _rested(config, state, config.empty_s):
-        return state
-    return dataclasses.replace(_enter(state, Stage.PLACE), empty=empty_pad(state.window), trusted=False)
-
-
 def confirm(state: State) -> State:
     """The state after the person has confirmed that the pad is empty, the object released, or the trajectory good."""
-    match state.stage:
-        case Stage.CLEAR:
-            return dataclasses.replace(state, trusted=True, window=(), count=0)
-        case Stage.RELEASE:
-            return _enter(state, Stage.STILL)
-        case Stage.REVIEW:
-            return _enter(state, Stage.CLEAR)
-    return state
+    if state.stage is Stage.CLEAR:
+        return dataclasses.replace(interrupted(state), trusted=True)
+    return _enter(state, _CONFIRMED[state.stage]) if state.stage in _CONFIRMED else state
 
 
 def discard(state: State) -> State:
@@ -246,27 +247,10 @@ def _rested(config: GuideConfig, state: State, least_s: float) -> bool:
     return state.count >= config.pairs and state.window[-1].time_s - state.window[0].time_s >= least_s
 
 
-_INSTRUCTIONS = {
-    Stage.CLEAR: "Take everything off the pad and out of view.",
-    Stage.PLACE: "Place the object on the pad in an unstable pose, and keep holding it.",
-    Stage.HOLD: "Hold the object still.",
-    Stage.RELEASE: "Release the object, and take your hand out of view.",
-    Stage.STILL: "Wait until nothing moves.",
-    Stage.REVIEW: "Confirm or discard this trajectory.",
-}
-_HINTS = {
-    Stage.CLEAR: "If the pad is empty, confirm, and it is measured again.",
-    Stage.PLACE: "If the object lies on the pad, press it harder. The tactile image shows no contact yet.",
-    Stage.HOLD: "The image still changes. Rest your hand on the edge of the pad.",
-    Stage.RELEASE: "If the object stays where it was, confirm.",
-    Stage.STILL: "The image still changes. Check that nobody is in view and that the room's light is steady.",
-}
-
-
 def instruction(config: GuideConfig, state: State) -> str:
     """The instruction for the person, after `config.hint_s` seconds in the same stage with a hint."""
+    words, hint = _WORDS[state.stage]
     if state.stage is Stage.CLEAR and state.empty is None and not state.trusted:
-        return f"{_INSTRUCTIONS[Stage.CLEAR]} Then confirm."
+        return f"{words} Then confirm."
     late = state.now_s is not None and state.since_s is not None and state.now_s - state.since_s >= config.hint_s
-    hint = _HINTS.get(state.stage) if late else None
-    return _INSTRUCTIONS[state.stage] if hint is None else f"{_INSTRUCTIONS[state.stage]} {hint}"
+    return f"{words} {hint}".rstrip() if late else words

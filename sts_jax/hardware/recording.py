@@ -1,20 +1,17 @@
 """`Recorder` writes both streams of a sensor to a folder, and `Replay` plays them back through the sensor's methods.
 
-    recording.json         the sensor (`Origin`), the encoding, and the settling times of the lights
     visual.mkv             images without light, as a video that other programs can play
     tactile.mkv            images with light
     frames.jsonl           one line for each image: its stream, its times, and the proof of light
     sensor.json            only if a sensor file was given: a copy, with its background images
-    manifest.json          checksums of the files above, written at the end
+    manifest.json          the sensor (`Origin`) and the encoding, and at the end checksums of the files above
 
 The manifest of an interrupted recording does not list the videos. Such a recording ends with the last line of
 frames.jsonl whose image is in a video.
 """
 
-import collections
 import contextlib
 import dataclasses
-import datetime
 import itertools
 import json
 import math
@@ -30,14 +27,12 @@ import av
 import numpy as np
 
 from sts_jax import storage
-from sts_jax.hardware import protocol
-from sts_jax.hardware.leds import Lit
-from sts_jax.hardware.proof import Pair, Settling, Shot, Stream
+from sts_jax.hardware.proof import Pair, Shot, Stream
 from sts_jax.hardware.sensor_file import Device, copy_sensor, sensor_file
 from sts_jax.hardware.session import Origin, shot_facts, shot_of
 from sts_jax.storage import DamagedFileError
 
-HEAD, FRAMES = "recording.json", "frames.jsonl"
+FRAMES = "frames.jsonl"
 Encoding = Literal["ffv1", "mjpeg"]
 
 # Pixel format and options of each codec. FFV1 with Golomb codes, which are faster, motion JPEG at its best quality.
@@ -56,18 +51,7 @@ _NO_IMAGE = np.zeros((0, 0, 3), np.uint8)
 class Recorder:
     """Writes the images of a sensor to a folder. `Replay` plays the recording back.
 
-    ```python
-    with hardware.STS.from_file("bench") as sensor:
-        with hardware.Recorder("runs/monday", hardware.Origin.of(sensor), file="bench") as recorder:
-            for shot in sensor.stream():
-                recorder.add(shot)
-    ```
-
     If the process is killed, the newest image of each stream is lost. A power failure can lose the last seconds.
-
-    Attributes:
-        folder: Folder of the recording.
-        counts: Number of recorded images of each stream.
     """
 
     def __init__(
@@ -75,7 +59,6 @@ class Recorder:
         folder: str | os.PathLike,
         origin: Origin,
         *,
-        settling: Settling | None = None,
         encoding: Encoding = "ffv1",
         file: str | os.PathLike | None = None,
     ):
@@ -84,28 +67,21 @@ class Recorder:
         Args:
             folder: Folder of the recording, which must be empty or missing.
             origin: Identity of the sensor.
-            settling: Settling times of the lights, which are stored with the recording. None: not stored.
             encoding: "ffv1" is lossless. "mjpeg" is faster and needs about a quarter of the space.
             file: Path of the sensor file or of its folder, which is copied into the recording. None: no copy.
         """
         self.folder = Path(folder)
-        self.counts = {"visual": 0, "tactile": 0}
+        self.counts = {"visual": 0, "tactile": 0}  # number of recorded images of each stream
         self._size = origin.height, origin.width
         self._encoding = encoding
         self._start_s: float | None = None  # time of the first image (s)
-        self._videos: dict[str, tuple[av.container.OutputContainer, av.VideoStream]] = {}
+        self._videos: dict[Stream, tuple[av.container.OutputContainer, av.VideoStream]] = {}
         self._open = True
         if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
             raise FileExistsError(f"{self.folder} is not an empty folder: give the name of a new folder.")
-        self.folder.mkdir(parents=True, exist_ok=True)
-        self._copied = {} if file is None else copy_sensor(file, self.folder)
-        head = {
-            "encoding": encoding,
-            "origin": dataclasses.asdict(origin),
-            "settling": None if settling is None else dataclasses.asdict(settling),
-            "begun": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        }
-        storage.write_json(self.folder / HEAD, head)
+        copied = {} if file is None else copy_sensor(file, self.folder)
+        facts = {"encoding": encoding, "origin": dataclasses.asdict(origin)}
+        self._manifest = storage.write_manifest(self.folder, copied, facts)
         self._lines = (self.folder / FRAMES).open("ab", buffering=0)
 
     def add(self, shot: Shot) -> None:
@@ -155,15 +131,15 @@ class Recorder:
         """Close the files, and write the manifest. Closing twice is allowed."""
         if not self._open:
             return
+        names = [FRAMES, *(f"{stream}.mkv" for stream in self._videos)]
         try:
             for container, video in self._videos.values():
                 container.mux(video.encode())
                 container.close()
         finally:
             self._end()
-        written = {path.name for path in self.folder.iterdir()} - {storage.MANIFEST} - self._copied.keys()
-        files = {**self._copied, **storage.checksums(self.folder, sorted(written))}
-        storage.write_manifest(self.folder, files)
+        files = {**self._manifest.files, **storage.checksums(self.folder, names)}
+        storage.write_manifest(self.folder, files, self._manifest.facts)
 
     def __enter__(self) -> "Recorder":
         return self
@@ -175,31 +151,16 @@ class Recorder:
 class Replay:
     """A recording of visual and tactile images, which is read with methods of a connected sensor (`STS`).
 
-    ```python
-    with hardware.Replay("runs/monday") as sensor:
-        pair = sensor.read()
-    ```
-
     An image that arrived 2 s after the beginning of the recording becomes available 2 s after `connect`, or after 1 s
     with `speed=2`. A program that reads too slowly misses images, as with a sensor. The times in each `Shot` are times
     of the replay on the clock `time.monotonic`.
-
-    Attributes:
-        skipped: Number of images since `connect` that were left out because the program read too slowly.
     """
 
-    def __init__(
-        self,
-        source: str | os.PathLike | tuple[str | os.PathLike, str | os.PathLike],
-        *,
-        speed: float | None = 1.0,
-        loop: bool = False,
-    ):
+    def __init__(self, folder: str | os.PathLike, *, speed: float | None = 1.0, loop: bool = False):
         """Open a recording, and compare its checksums.
 
         Args:
-            source: Folder of a recording, or the visual and the tactile video of another program. Frames of these
-                videos with the same number form a pair, and their times of the proof of light are NaN.
+            folder: Folder of the recording.
             speed: Seconds of the recording that are played per second, > 0. None: as fast as the program reads,
                 without missing images.
             loop: If True, the replay continues from the beginning after the end of the recording, with a larger
@@ -207,28 +168,17 @@ class Replay:
         """
         if speed is not None and not (speed > 0 and math.isfinite(speed)):
             raise ValueError(f"speed must be > 0 and finite, or None, got {speed}")
-        self._speed, self._loop = speed, loop
-        self._folder: Path | None = None
-        if isinstance(source, tuple):
-            self._name = " and ".join(map(str, source))
-            self._videos: dict[Stream, Path] = {"visual": Path(source[0]), "tactile": Path(source[1])}
-            self._stills = _unproven(self._videos)
-        else:
-            self._folder = sensor_file(source).parent
-            self._name = str(self._folder)
-            self._videos = {"visual": self._folder / "visual.mkv", "tactile": self._folder / "tactile.mkv"}
-            self._stills = _recorded(self._folder, self._videos)
+        self.folder, self._speed, self._loop = Path(folder), speed, loop
+        self._stills = _recorded(self.folder)
         if not self._stills:
-            raise ValueError(f"{self._name} has no image: make a new recording.")
+            raise ValueError(f"{self.folder} has no image: make a new recording.")
         self._shots: Iterator[Shot] | None = None
-        self.skipped = 0
+        self.skipped = 0  # images since `connect` that were left out because the program read too slowly
 
     @property
     def device(self) -> Device | None:
         """The recorded sensor, or None if the recording has no `sensor.json`."""
-        if self._folder is None or not sensor_file(self._folder).exists():
-            return None
-        return Device.load(self._folder)
+        return Device.load(self.folder) if sensor_file(self.folder).exists() else None
 
     def connect(self) -> "Replay":
         """Start the replay, or start it again from the beginning."""
@@ -239,7 +189,7 @@ class Replay:
     def stream(self) -> Iterator[Shot]:
         """Iterate over the images in the order of the recording. Each step waits until its image is available."""
         if self._shots is None:
-            raise RuntimeError(f"the replay of {self._name} is not connected: call connect() first.")
+            raise RuntimeError(f"the replay of {self.folder} is not connected: call connect() first.")
         return self._shots
 
     def read(self) -> Pair:
@@ -256,7 +206,7 @@ class Replay:
             if last is not None and last.stream != shot.stream and connection == (last.epoch, last.before.boot):
                 return Pair(last, shot) if shot.stream == "tactile" else Pair(shot, last)
             last = shot
-        raise EOFError(f"{self._name} has no further pair of images: call connect() to start again, or use loop=True.")
+        raise EOFError(f"{self.folder} has no further pair of images: call connect() to start again, or use loop=True.")
 
     def __enter__(self) -> "Replay":
         return self if self._shots is not None else self.connect()
@@ -271,7 +221,7 @@ class Replay:
         lap_s = self._stills[-1].time_s - first_s + (statistics.median(steps) if steps else 0.0)
         epochs = 1 + self._stills[-1].epoch - self._stills[0].epoch
         for lap in itertools.count() if self._loop else range(1):
-            frames = {stream: _frames(path) for stream, path in self._videos.items()}
+            frames = {stream: _frames(self.folder / f"{stream}.mkv") for stream in ("visual", "tactile")}
             for still in self._stills:
                 frame = next(frames[still.stream])
                 due_s = start_s + (lap * lap_s + still.time_s - first_s) / speed
@@ -297,17 +247,14 @@ class Replay:
                 )
 
 
-def _recorded(folder: Path, videos: dict[Stream, Path]) -> list[Shot]:
+def _recorded(folder: Path) -> list[Shot]:
     """The images of a recording, without their pixels."""
-    if not (folder / HEAD).exists():
-        raise FileNotFoundError(
-            f"{folder} holds no recording ({HEAD} is missing): give the folder of a recording, or two videos."
-        )
     manifest = storage.read_manifest(folder, _AGAIN)
-    if manifest is not None:
-        storage.verify(folder, manifest, _AGAIN)
+    if manifest is None or "encoding" not in manifest.facts:
+        raise FileNotFoundError(f"{folder} holds no recording: give the folder of a recording.")
+    storage.verify(folder, manifest, _AGAIN)
     # An interrupted program leaves an incomplete last line, and lines whose images are not in the videos yet.
-    left = collections.Counter({stream: _count(path) for stream, path in videos.items()})
+    left = {stream: _count(folder / f"{stream}.mkv") for stream in ("visual", "tactile")}
     stills = []
     for number, line in enumerate((folder / FRAMES).read_bytes().split(b"\n")[:-1], 1):
         try:
@@ -321,41 +268,11 @@ def _recorded(folder: Path, videos: dict[Stream, Path]) -> list[Shot]:
     return stills
 
 
-def _unproven(videos: dict[Stream, Path]) -> list[Shot]:
-    """The images of two videos without times of the light, without their pixels."""
-    try:
-        times = {stream: sorted(_times(path)) for stream, path in videos.items()}
-    except EOFError as error:
-        raise ValueError(f"a video is truncated ({error}): copy it again.") from error
-    counts = {stream: len(seen) for stream, seen in times.items()}
-    if abs(counts["visual"] - counts["tactile"]) > 1:
-        raise ValueError(
-            f"the visual video has {counts['visual']} frames, but the tactile video has {counts['tactile']}: cut both "
-            "to the same period of time, so that frames with the same number show the same moment."
-        )
-    lit = {
-        stream: Lit(levels, 0, 0, math.nan, math.nan)
-        for stream, levels in (("visual", protocol.DARK), ("tactile", (255,) * 4))
-    }
-    return [
-        Shot(_NO_IMAGE, stream, time_s, number, 0, lit[stream], math.nan)
-        for number, time_s in enumerate(times["visual"][: min(counts.values())])
-        for stream in videos
-    ]
-
-
-def _times(path: Path) -> list[float]:
-    """The times of the frames of a video (s), in the order of the file."""
-    with av.open(str(path)) as container:
-        return [
-            float((packet.pts or 0) * (packet.time_base or 0)) for packet in container.demux(video=0) if packet.size
-        ]
-
-
 def _count(path: Path) -> int:
     """The number of frames of a video, whose program may have been interrupted before the first frame."""
     try:
-        return len(_times(path))
+        with av.open(str(path)) as container:
+            return sum(packet.size > 0 for packet in container.demux(video=0))
     except (FileNotFoundError, EOFError):
         return 0
 

@@ -34,14 +34,6 @@ Text = Annotated[str, Field(pattern=r"\S")]
 Raw = UInt8[np.ndarray, "height width 3"]
 
 
-class SensorFileError(ValueError):
-    """A sensor file is damaged, incomplete or edited. The message names the file and a remedy."""
-
-
-class WrongDeviceError(SensorFileError):
-    """The connected camera or LED controller is not the one that the sensor file describes."""
-
-
 @dataclasses.dataclass(frozen=True)
 class Device:
     """The description of a real sensor: the camera, the LED controller, the lens and the measured settings."""
@@ -109,10 +101,8 @@ class Device:
         file = sensor_file(path)
         content = dataclasses.asdict(self)
         storage.decode(Device, content, "device")
-        files: dict[str, str] = {}
-        if backgrounds is None:
-            manifest = storage.read_manifest(file.parent, _AGAIN)
-            files |= {} if manifest is None else manifest.files
+        manifest = storage.read_manifest(file.parent, _AGAIN) if backgrounds is None else None
+        files = {} if manifest is None else manifest.files
         for name, image in zip(BACKGROUNDS, backgrounds or (), strict=False):
             if image.shape != (self.height, self.width, 3):
                 raise ValueError(f"a background has shape {image.shape}, but the lens {(self.height, self.width, 3)}")
@@ -125,28 +115,19 @@ class Device:
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> "Device":
-        """Read the device from a sensor file or its folder, and compare all files with the manifest.
-
-        Raises:
-            FileNotFoundError: There is no such file.
-            SensorFileError: A file is damaged, edited or missing, or the sensor is a simulated one.
-        """
+        """Read the device from a sensor file or its folder, and compare all files with the manifest."""
         file = sensor_file(path)
         checksums(file)
         device = storage.read_json(file, _AGAIN).get("device")
         if device is None:
-            raise SensorFileError(f"{file} describes no device, but a simulated sensor: {_AGAIN}.")
+            raise ValueError(f"{file} describes no device, but a simulated sensor: {_AGAIN}.")
         try:
             return storage.decode(cls, device, "device")
         except ValueError as error:
-            raise SensorFileError(f"{file}: {error}: {_AGAIN}.") from error
+            raise ValueError(f"{file}: {error}: {_AGAIN}.") from error
 
     def backgrounds(self, path: str | os.PathLike) -> tuple[Raw, Raw] | None:
-        """Read the raw images of the empty pad without and with light, or None if none were recorded.
-
-        Args:
-            path: The sensor file or its folder.
-        """
+        """Raw images of the empty pad without and with light, beside a sensor file. None if none were recorded."""
         file = sensor_file(path)
         if not set(BACKGROUNDS) <= checksums(file).keys():
             return None
@@ -154,7 +135,7 @@ class Device:
         return visual, tactile
 
     def check_identity(self, *, camera: str | None = None, leds: str | None = None) -> None:
-        """Raise a `WrongDeviceError` if the connected camera or LED controller is not the one of this `Device`.
+        """Raise a ValueError if the connected camera or LED controller is not the one of this `Device`.
 
         Args:
             camera: Path or URL of the connected camera. None: the camera is not compared.
@@ -166,7 +147,7 @@ class Device:
         if leds is not None and leds != self.leds:
             different.append(f"LED controller {leds}")
         if different:
-            raise WrongDeviceError(
+            raise ValueError(
                 f"the sensor file describes camera {self.camera} and LED controller {self.leds}, but the connected "
                 f"sensor has {' and '.join(different)}: load its own sensor file, or make one with "
                 "`python -m experiments.commission`."
@@ -181,12 +162,12 @@ def sensor_file(path: str | os.PathLike) -> Path:
 
 def copy_sensor(path: str | os.PathLike, folder: Path) -> dict[str, str]:
     """Copy an undamaged sensor file as `sensor.json`, with its images and a manifest. Returns the files' checksums."""
-    file = sensor_file(path)
-    files = checksums(file)
+    file, copied = sensor_file(path), {}
     folder.mkdir(parents=True, exist_ok=True)
-    for name in files:
-        shutil.copyfile(file.with_name(name), folder / (NAME if name == file.name else name))
-    copied = {NAME if name == file.name else name: digest for name, digest in files.items()}
+    for name, digest in checksums(file).items():
+        copy = NAME if name == file.name else name
+        shutil.copyfile(file.with_name(name), folder / copy)
+        copied[copy] = digest
     storage.write_manifest(folder, copied)
     return copied
 
@@ -196,17 +177,14 @@ def checksums(path: str | os.PathLike) -> dict[str, str]:
     file = sensor_file(path)
     if not file.exists():
         raise FileNotFoundError(f"{file} does not exist: give the folder of a sensor file, or {_AGAIN}")
-    try:
-        manifest = storage.read_manifest(file.parent, _AGAIN)
-        if manifest is None:
-            raise SensorFileError(
-                f"{file.parent} has no {storage.MANIFEST}, so {file.name} is incomplete or that of a simulated sensor: "
-                f"{_AGAIN}."
-            )
-        names = [file.name, *(name for name in BACKGROUNDS if name in manifest.files)]
-        storage.verify(file.parent, manifest, _AGAIN, names)
-    except storage.DamagedFileError as error:
-        raise SensorFileError(str(error)) from error
+    manifest = storage.read_manifest(file.parent, _AGAIN)
+    if manifest is None:
+        raise ValueError(
+            f"{file.parent} has no {storage.MANIFEST}, so {file.name} is incomplete or that of a simulated sensor: "
+            f"{_AGAIN}."
+        )
+    names = [file.name, *(name for name in BACKGROUNDS if name in manifest.files)]
+    storage.verify(file.parent, manifest, _AGAIN, names)
     return {name: manifest.files[name] for name in names}
 
 

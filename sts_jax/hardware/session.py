@@ -25,16 +25,15 @@ import cv2
 import numpy as np
 from jaxtyping import Int, UInt8
 
-from sts_jax import optics, storage
+from sts_jax import storage
 from sts_jax.hardware import protocol
 from sts_jax.hardware.guide import End
 from sts_jax.hardware.leds import Lit
-from sts_jax.hardware.lens import Lens, rectified
-from sts_jax.hardware.proof import Pair, Settling, Shot, Stream
+from sts_jax.hardware.proof import Pair, Shot, Stream
 from sts_jax.hardware.sts import STS
 from sts_jax.storage import MANIFEST, DamagedFileError
 
-TRAJECTORIES, DISCARDED = "trajectories", "discarded"
+_TRAJECTORIES, _DISCARDED = "trajectories", "discarded"
 _ENDS: tuple[End, End] = ("initial", "final")
 _STREAMS: tuple[Stream, Stream] = ("visual", "tactile")
 # Filters and Huffman codes only, because full deflate is slower and does not make noisy images smaller.
@@ -97,106 +96,117 @@ class Entry(NamedTuple):
     note: str  # text that was stored with the confirmation, may be empty
 
 
-class Recordings:
-    """The confirmed trajectories of a session, as a sequence of `RecordedTrajectory`, from `load_recordings`.
+class Session:
+    """A folder to which trajectories are added.
 
-    Each access to a trajectory reads its files and compares their checksums. The numbers are read once, so later
-    changes of the session do not change them.
-
-    Attributes:
-        folder: Folder of the session.
-        origin: The sensor.
-        numbers: Numbers of the trajectories.
+    When `save`, `confirm` or `discard` returns, the change is on disk and survives a loss of power. If it raises an
+    OSError, for example because the disk is full, nothing has changed, and the call can be repeated.
     """
 
-    def __init__(self, folder: str | os.PathLike):
-        self.folder = Path(folder)
-        self.origin = _read_origin(self.folder)
-        self.numbers = tuple(e.number for e in list_recordings(self.folder) if e.standing == "confirmed")
-
-    def __len__(self) -> int:
-        return len(self.numbers)
-
-    @property
-    def identity(self) -> str:
-        """SHA-256 that changes when a trajectory is confirmed, discarded or replaced."""
-        files = {str(number): _trajectory(self.folder, number) / MANIFEST for number in self.numbers}
-        return storage.digest({number: storage.sha256(file) for number, file in files.items()})
-
-    def __getitem__(self, index: int) -> RecordedTrajectory:
-        return _read(self.folder, self.numbers[index], self.origin)
-
-    def __iter__(self) -> Iterator[RecordedTrajectory]:
-        return (self[index] for index in range(len(self)))
-
-    def images(
-        self,
-        convert: Callable[[Image], Image] = lambda image: image,
-        progress: Callable[[int, int], None] = lambda done, total: None,
-    ) -> RecordedImages:
-        """Read the images of all trajectories into arrays. 500 trajectories of 1640 x 1232 pixels need 12 GB.
+    def __init__(self, folder: str | os.PathLike, origin: Origin | None = None):
+        """Start a new session, or continue an existing one. The folder is locked until `close`.
 
         Args:
-            convert: Function that is applied to each raw image, for example to rectify it. All results must have the
-                same shape.
-            progress: Called after each trajectory with the numbers of trajectories done so far and in all.
+            folder: Folder of the session.
+            origin: Identity of the sensor, which is compared with that of an existing session. None: not compared.
         """
-        if not self.numbers:
-            raise ValueError(
-                f"{self.folder} has no confirmed trajectory: collect trajectories, or confirm existing ones with "
-                "`python -m experiments.real review --confirm NUMBER`."
+        self.folder = Path(folder)
+        if origin is None:
+            _read_origin(self.folder)
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(storage.lock(self.folder))
+            self._origin = _prepare(self.folder, origin)
+            self._lock = stack.pop_all()
+        self._next = next_recording(folder)
+        self._confirmed = {entry.number for entry in list_recordings(folder) if entry.standing == "confirmed"}
+
+    @property
+    def confirmed(self) -> int:
+        """Number of confirmed trajectories."""
+        return len(self._confirmed)
+
+    def check_ready(self) -> None:
+        """Raise an OSError unless there is enough space for a whole trajectory."""
+        free = shutil.disk_usage(self.folder).free
+        needed = 4 * 3 * self._origin.width * self._origin.height  # uncompressed size of a trajectory's images
+        if free < needed:
+            raise OSError(
+                f"cannot start a new trajectory, because only {free / 1e6:.0f} MB are free in {self.folder}, but at "
+                f"least {needed / 1e6:.0f} MB must be free: free some disk space."
             )
-        visual, tactile = [], []
-        for done, trajectory in enumerate(self, 1):
-            ends = trajectory.initial, trajectory.final
-            visual.append([convert(pair.visual.image) for pair in ends])
-            tactile.append([convert(pair.tactile.image) for pair in ends])
-            progress(done, len(self))
-        return RecordedImages(np.array(visual), np.array(tactile), np.array(self.numbers))
+
+    def begin(self) -> int:
+        """Reserve a number for a new trajectory and return it. Numbers are never used twice."""
+        number, self._next = self._next, self._next + 1
+        return number
+
+    def save(self, number: int, end: End, pair: Pair) -> None:
+        """Write a pair of images: "initial" of the held object, or "final" of the object at rest."""
+        facts: dict[str, Any] = {shot.stream: shot_facts(shot) for shot in (pair.visual, pair.tactile)}
+        folder = _trajectory(self.folder, number)
+        storage.write_folder(folder / end, encoded_pair(pair), facts)
+        storage.flush_folder(folder.parent)
+
+    def confirm(self, number: int, note: str = "") -> None:
+        """Confirm a trajectory whose pairs were saved, so that `load_recordings` includes it. The note is stored."""
+        path = _trajectory(self.folder, number)
+        files = {}
+        for end in _ENDS:
+            pair = storage.read_manifest(path / end, _remedy(number))
+            if pair is None:
+                raise FileNotFoundError(
+                    f"trajectory {number} cannot be confirmed, because it has no {end} pair of images ({path / end}): "
+                    "discard it, or give the number of another trajectory."
+                )
+            # The checksums from the time when the images were written, so that later damage is found.
+            files.update({f"{end}/{name}": checksum for name, checksum in pair.files.items()})
+        files.update(storage.checksums(path, [f"{end}/{MANIFEST}" for end in _ENDS]))
+        now = datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
+        origin = storage.digest(dataclasses.asdict(self._origin))
+        storage.write_manifest(path, files, {"number": number, "origin": origin, "confirmed": now, "note": note})
+        storage.flush_folder(path)
+        self._confirmed.add(number)
+
+    def discard(self, number: int) -> None:
+        """Move a trajectory to the folder `discarded`, so that `load_recordings` leaves it out. Nothing is deleted."""
+        _move(_trajectory(self.folder, number), _trajectory(self.folder, number, _DISCARDED))
+        self._confirmed.discard(number)
+
+    def restore(self, number: int) -> None:
+        """Restore a discarded trajectory. If it was confirmed before it was discarded, it is confirmed again."""
+        path = _trajectory(self.folder, number)
+        _move(_trajectory(self.folder, number, _DISCARDED), path)
+        if (path / MANIFEST).exists():
+            self._confirmed.add(number)
+
+    def close(self) -> None:
+        """Unlock the folder."""
+        self._lock.close()
+
+    def __enter__(self) -> "Session":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
-def load_recordings(folder: str | os.PathLike) -> Recordings:
-    """The confirmed trajectories of the session in a folder. Another process may add trajectories meanwhile."""
-    return Recordings(folder)
-
-
-def list_recordings(folder: str | os.PathLike) -> list[Entry]:
-    """List all trajectories of a session, unconfirmed and discarded ones included, ordered by number."""
-    _read_origin(Path(folder))
-    entries = [_entry(path, number, discarded=kind == DISCARDED) for kind, number, path in _numbered(Path(folder))]
-    return sorted(entries, key=lambda entry: entry.number)
-
-
-def next_recording(folder: str | os.PathLike) -> int:
-    """The number of a session's next trajectory: the highest number plus 1, or 0 without trajectories."""
-    return max((number for _, number, _ in _numbered(Path(folder))), default=-1) + 1
-
-
-def confirm_recording(folder: str | os.PathLike, number: int, note: str = "") -> None:
-    """Confirm a trajectory, so that `load_recordings` includes it. The session must not be open."""
-    with _locked(folder) as session:
-        _confirm(session, number, note)
-
-
-def discard_recording(folder: str | os.PathLike, number: int) -> None:
-    """Move a trajectory to the folder `discarded`, so that `load_recordings` leaves it out. Nothing is deleted."""
-    with _locked(folder) as session:
-        _move(_trajectory(session, number), _trajectory(session, number, DISCARDED))
-
-
-def restore_recording(folder: str | os.PathLike, number: int) -> None:
-    """Restore a discarded trajectory. If it was confirmed before it was discarded, it is confirmed again."""
-    with _locked(folder) as session:
-        _move(_trajectory(session, number, DISCARDED), _trajectory(session, number))
-
-
-@contextlib.contextmanager
-def _locked(folder: str | os.PathLike) -> Iterator[Path]:
-    """Check that a folder is a session, and lock it."""
-    path = Path(folder)
-    _read_origin(path)
-    with storage.lock(path):
-        yield path
+def _prepare(folder: Path, origin: Origin | None) -> Origin:
+    """Write the manifest of a session, or compare it, and remove what a killed process has left."""
+    if origin is not None and not (folder / MANIFEST).exists():
+        storage.write_manifest(folder, {}, dataclasses.asdict(origin))
+    recorded = _read_origin(folder)
+    now, before = dataclasses.asdict(origin or recorded), dataclasses.asdict(recorded)
+    if changed := [name for name in now if now[name] != before[name]]:
+        raise ValueError(
+            f"{folder} was recorded with {', '.join(f'{name} = {before[name]!r}' for name in changed)}, but this "
+            f"sensor has {', '.join(f'{name} = {now[name]!r}' for name in changed)}: choose another folder."
+        )
+    for kind in (_TRAJECTORIES, _DISCARDED):
+        (folder / kind).mkdir(exist_ok=True)
+    for rest in (*folder.glob(".*.partial"), *folder.glob(f"{_TRAJECTORIES}/*/.*.partial")):
+        shutil.rmtree(rest) if rest.is_dir() else rest.unlink()
+    storage.flush_folder(folder)
+    return recorded
 
 
 def _read_origin(folder: Path) -> Origin:
@@ -209,33 +219,39 @@ def _read_origin(folder: Path) -> Origin:
         raise ValueError(f"{folder} holds no session ({error}): give the folder of a session.") from error
 
 
-def _prepare(folder: Path, origin: Origin) -> None:
-    """Write the manifest of a session, or compare it, and remove what a killed process has left."""
-    if not (folder / MANIFEST).exists():
-        storage.write_manifest(folder, {}, dataclasses.asdict(origin))
-    now, recorded = dataclasses.asdict(origin), dataclasses.asdict(_read_origin(folder))
-    if changed := [name for name in now if now[name] != recorded[name]]:
-        raise ValueError(
-            f"{folder} was recorded with {', '.join(f'{name} = {recorded[name]!r}' for name in changed)}, but this "
-            f"sensor has {', '.join(f'{name} = {now[name]!r}' for name in changed)}: choose another folder."
-        )
-    for kind in (TRAJECTORIES, DISCARDED):
-        (folder / kind).mkdir(exist_ok=True)
-    for rest in (*folder.glob(".*.partial"), *folder.glob(f"{TRAJECTORIES}/*/.*.partial")):
-        shutil.rmtree(rest) if rest.is_dir() else rest.unlink()
-    storage.flush_folder(folder)
-
-
-def _trajectory(folder: Path, number: int, kind: str = TRAJECTORIES) -> Path:
+def _trajectory(folder: Path, number: int, kind: str = _TRAJECTORIES) -> Path:
     return folder / kind / f"{number:05d}"
 
 
 def _numbered(folder: Path) -> Iterator[tuple[str, int, Path]]:
     """The kind ("trajectories" or "discarded"), the number and the folder of each trajectory."""
-    for kind in (TRAJECTORIES, DISCARDED):
+    for kind in (_TRAJECTORIES, _DISCARDED):
         for path in (folder / kind).glob("[0-9]*"):
             if path.name.isdecimal() and path.is_dir():
                 yield kind, int(path.name), path
+
+
+def _move(source: Path, target: Path) -> None:
+    if not source.is_dir():
+        raise FileNotFoundError(
+            f"trajectory folder {source} does not exist: list the trajectories with list_recordings()."
+        )
+    if target.exists():
+        raise FileExistsError(f"{source} cannot be moved to {target}, which exists already: remove one of the two.")
+    source.rename(target)
+    for path in (target.parent, source.parent):
+        storage.flush_folder(path)
+
+
+def _remedy(number: int) -> str:
+    return f"restore the file from a backup, or discard trajectory {number}"
+
+
+def list_recordings(folder: str | os.PathLike) -> list[Entry]:
+    """List all trajectories of a session, unconfirmed and discarded ones included, ordered by number."""
+    _read_origin(Path(folder))
+    entries = [_entry(path, number, discarded=kind == _DISCARDED) for kind, number, path in _numbered(Path(folder))]
+    return sorted(entries, key=lambda entry: entry.number)
 
 
 def _entry(path: Path, number: int, *, discarded: bool) -> Entry:
@@ -252,17 +268,101 @@ def _entry(path: Path, number: int, *, discarded: bool) -> Entry:
     return Entry(number, standing, taken, note)
 
 
-def _move(source: Path, target: Path) -> None:
-    if not source.is_dir():
-        raise FileNotFoundError(
-            f"trajectory folder {source} does not exist: list the trajectories with list_recordings()."
-        )
-    if target.exists():
-        raise FileExistsError(f"{source} cannot be moved to {target}, which exists already: remove one of the two.")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    source.rename(target)
-    for path in (target.parent, source.parent):
-        storage.flush_folder(path)
+def next_recording(folder: str | os.PathLike) -> int:
+    """The number of a session's next trajectory: the highest number plus 1, or 0 without trajectories."""
+    return max((number for _, number, _ in _numbered(Path(folder))), default=-1) + 1
+
+
+def load_recordings(folder: str | os.PathLike) -> "Recordings":
+    """The confirmed trajectories of the session in a folder. Another process may add trajectories meanwhile."""
+    return Recordings(folder)
+
+
+class Recordings:
+    """The confirmed trajectories of a session, as a sequence of `RecordedTrajectory`, from `load_recordings`.
+
+    Each access to a trajectory reads its files and compares their checksums. The numbers are read once, so later
+    changes of the session do not change them.
+    """
+
+    def __init__(self, folder: str | os.PathLike):
+        self.folder = Path(folder)
+        self.origin = _read_origin(self.folder)  # the sensor
+        self.numbers = tuple(e.number for e in list_recordings(self.folder) if e.standing == "confirmed")
+
+    @property
+    def identity(self) -> str:
+        """SHA-256 that changes when a trajectory is confirmed, discarded or replaced."""
+        files = {str(number): _trajectory(self.folder, number) / MANIFEST for number in self.numbers}
+        return storage.digest({number: storage.sha256(file) for number, file in files.items()})
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def __iter__(self) -> Iterator[RecordedTrajectory]:
+        return (self[index] for index in range(len(self)))
+
+    def __getitem__(self, index: int) -> RecordedTrajectory:
+        number = self.numbers[index]
+        path, remedy = _trajectory(self.folder, number), _remedy(number)
+        manifest = storage.read_manifest(path, remedy)
+        if manifest is None:
+            raise FileNotFoundError(f"trajectory {number} of {self.folder} is not confirmed any more: load it again.")
+        facts = manifest.facts
+        if (facts.get("number"), facts.get("origin")) != (number, storage.digest(dataclasses.asdict(self.origin))):
+            raise DamagedFileError(
+                f"{path} belongs to trajectory {facts.get('number')} or to a session of another sensor: move it back, "
+                f"or discard trajectory {number}."
+            )
+        storage.verify(path, manifest, remedy)
+        initial, final = (_read_pair(path / end, remedy) for end in _ENDS)
+        return RecordedTrajectory(number, initial, final, facts["confirmed"], facts["note"])
+
+    def images(
+        self,
+        convert: Callable[[Image], Image] = lambda image: image,
+        progress: Callable[[int, int], None] = lambda done, total: None,
+    ) -> RecordedImages:
+        """Read the images of all trajectories into arrays. 500 trajectories of 1640 x 1232 pixels need 12 GB.
+
+        Args:
+            convert: Function that is applied to each raw image, for example `rectified` with the lens of the sensor.
+                All results must have the same shape.
+            progress: Called after each trajectory with the numbers of trajectories done so far and in all.
+        """
+        if not self.numbers:
+            raise ValueError(
+                f"{self.folder} has no confirmed trajectory: collect trajectories, or confirm existing ones with "
+                "`python -m experiments.real review --confirm NUMBER`."
+            )
+        visual, tactile = [], []
+        for done, trajectory in enumerate(self, 1):
+            ends = trajectory.initial, trajectory.final
+            visual.append([convert(pair.visual.image) for pair in ends])
+            tactile.append([convert(pair.tactile.image) for pair in ends])
+            progress(done, len(self))
+        return RecordedImages(np.array(visual), np.array(tactile), np.array(self.numbers))
+
+
+def _read_pair(path: Path, remedy: str) -> Pair:
+    manifest = storage.read_manifest(path, remedy)
+    assert manifest is not None  # the manifest of the trajectory lists it
+    shots = []
+    for stream in _STREAMS:
+        image = cv2.cvtColor(cv2.imread(str(path / f"{stream}.png"), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+        image.flags.writeable = False
+        shots.append(shot_of(image, stream, manifest.facts[stream]))
+    return Pair(*shots)
+
+
+def encoded_pair(pair: Pair) -> dict[str, bytes]:
+    """Encode the images of a pair as `visual.png` and `tactile.png`."""
+    files = {}
+    for shot in (pair.visual, pair.tactile):
+        done, data = cv2.imencode(".png", cv2.cvtColor(shot.image, cv2.COLOR_RGB2BGR), _PNG)
+        assert done
+        files[f"{shot.stream}.png"] = data.tobytes()
+    return files
 
 
 def shot_facts(shot: Shot) -> dict[str, Any]:
@@ -282,187 +382,3 @@ def shot_of(image: Image, stream: Stream, facts: dict[str, Any]) -> Shot:
     """The image with the values that `shot_facts` returned."""
     before = storage.decode(Lit, facts["before"], "before")
     return Shot(image, stream, facts["time_s"], facts["sequence"], facts["epoch"], before, facts["until_s"])
-
-
-def encoded_pair(pair: Pair) -> dict[str, bytes]:
-    """Encode the images of a pair as `visual.png` and `tactile.png`."""
-    files = {}
-    for shot in (pair.visual, pair.tactile):
-        done, data = cv2.imencode(".png", cv2.cvtColor(shot.image, cv2.COLOR_RGB2BGR), _PNG)
-        assert done
-        files[f"{shot.stream}.png"] = data.tobytes()
-    return files
-
-
-def _confirm(folder: Path, number: int, note: str) -> None:
-    """Write the manifest of a trajectory. The session must be locked."""
-    path = _trajectory(folder, number)
-    files = {}
-    for end in _ENDS:
-        pair = storage.read_manifest(path / end, _remedy(number))
-        if pair is None:
-            raise FileNotFoundError(
-                f"trajectory {number} cannot be confirmed, because it has no {end} pair of images ({path / end}): "
-                "discard it, or give the number of another trajectory."
-            )
-        # The checksums from the time when the images were written, so that later damage is found.
-        files.update({f"{end}/{name}": checksum for name, checksum in pair.files.items()})
-    files.update(storage.checksums(path, [f"{end}/{MANIFEST}" for end in _ENDS]))
-    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
-    origin = storage.digest(dataclasses.asdict(_read_origin(folder)))
-    storage.write_manifest(path, files, {"number": number, "origin": origin, "confirmed": now, "note": note})
-    storage.flush_folder(path)
-
-
-def _read(folder: Path, number: int, origin: Origin) -> RecordedTrajectory:
-    """Read a confirmed trajectory, and compare the checksums of its files."""
-    path = _trajectory(folder, number)
-    manifest = storage.read_manifest(path, _remedy(number))
-    if manifest is None:
-        raise FileNotFoundError(
-            f"{folder} has no confirmed trajectory {number}: list the trajectories with list_recordings()."
-        )
-    facts = manifest.facts
-    if (facts.get("number"), facts.get("origin")) != (number, storage.digest(dataclasses.asdict(origin))):
-        raise DamagedFileError(
-            f"{path} belongs to trajectory {facts.get('number')} or to a session of another sensor: move it back, or "
-            f"discard trajectory {number} with discard_recording()."
-        )
-    storage.verify(path, manifest, _remedy(number))
-    initial, final = (_read_pair(path / end, number) for end in _ENDS)
-    return RecordedTrajectory(number, initial, final, facts["confirmed"], facts["note"])
-
-
-def _read_pair(path: Path, number: int) -> Pair:
-    manifest = storage.read_manifest(path, _remedy(number))
-    assert manifest is not None  # the manifest of the trajectory lists it
-    shots = []
-    for stream in _STREAMS:
-        image = cv2.cvtColor(cv2.imread(str(path / f"{stream}.png"), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
-        image.flags.writeable = False
-        shots.append(shot_of(image, stream, manifest.facts[stream]))
-    return Pair(*shots)
-
-
-def _remedy(number: int) -> str:
-    return f"restore the file from a backup, or discard trajectory {number} with discard_recording()"
-
-
-class Session:
-    """A folder to which trajectories are added.
-
-    ```python
-    with Session("runs/real/dataset", Origin.of(sensor)) as session:
-        session.check_ready()
-        number = session.begin()
-        session.save(number, "initial", sensor.read())
-        ...
-        session.save(number, "final", sensor.read())
-        session.confirm(number)
-    ```
-
-    When `save`, `confirm` or `discard` returns, the change is on disk and survives a loss of power. If it raises an
-    OSError, for example because the disk is full, nothing has changed, and the call can be repeated.
-    """
-
-    def __init__(self, folder: str | os.PathLike, origin: Origin, *, settling: Settling | None = None):
-        """Start a new session, or continue an existing one. The folder is locked until `close`.
-
-        Args:
-            folder: Folder of the session.
-            origin: Identity of the sensor. An existing session must have the same origin.
-            settling: Settling times of the lights, which are stored with each pair. None: not stored.
-        """
-        self.folder, self._settling = Path(folder), settling
-        with contextlib.ExitStack() as stack:
-            stack.enter_context(storage.lock(self.folder))
-            _prepare(self.folder, origin)
-            self._lock = stack.pop_all()
-        self._next = next_recording(folder)
-        self._confirmed = {entry.number for entry in list_recordings(folder) if entry.standing == "confirmed"}
-        self._raw_bytes = 4 * 3 * origin.width * origin.height  # uncompressed size of a trajectory's images
-
-    @property
-    def confirmed(self) -> int:
-        """Number of confirmed trajectories."""
-        return len(self._confirmed)
-
-    def check_ready(self) -> None:
-        """Raise an OSError unless there is enough space for a whole trajectory."""
-        free = shutil.disk_usage(self.folder).free
-        if free < self._raw_bytes:
-            raise OSError(
-                f"cannot start a new trajectory, because only {free / 1e6:.0f} MB are free in {self.folder}, but at "
-                f"least {self._raw_bytes / 1e6:.0f} MB must be free: free some disk space."
-            )
-
-    def begin(self) -> int:
-        """Reserve a number for a new trajectory and return it. Numbers are never used twice."""
-        number, self._next = self._next, self._next + 1
-        return number
-
-    def save(self, number: int, end: End, pair: Pair) -> None:
-        """Write a pair of images.
-
-        Args:
-            number: Number of the trajectory, from `begin`.
-            end: "initial" for the held object, "final" for the object at rest.
-            pair: The images.
-        """
-        facts: dict[str, Any] = {shot.stream: shot_facts(shot) for shot in (pair.visual, pair.tactile)}
-        facts["settling"] = None if self._settling is None else dataclasses.asdict(self._settling)
-        folder = _trajectory(self.folder, number)
-        storage.write_folder(folder / end, encoded_pair(pair), facts)
-        storage.flush_folder(folder.parent)
-
-    def confirm(self, number: int, note: str = "") -> None:
-        """Confirm a trajectory, after both of its pairs were saved.
-
-        Args:
-            number: Number of the trajectory.
-            note: Text that is stored with the trajectory.
-        """
-        _confirm(self.folder, number, note)
-        self._confirmed.add(number)
-
-    def discard(self, number: int) -> None:
-        """Move a trajectory to the folder `discarded`. Nothing is deleted."""
-        with contextlib.suppress(FileNotFoundError):  # no pair of it was saved
-            _move(_trajectory(self.folder, number), _trajectory(self.folder, number, DISCARDED))
-        self._confirmed.discard(number)
-
-    def close(self) -> None:
-        """Unlock the folder."""
-        self._lock.close()
-
-    def __enter__(self) -> "Session":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-def recorded_images(
-    recordings: Recordings,
-    lens: Lens,
-    pinhole: optics.Camera,
-    resolution: tuple[int, int] = (64, 64),
-    *,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> RecordedImages:
-    """Read and rectify the initial and final images of all confirmed trajectories, in the order of their numbers.
-
-    Args:
-        recordings: Confirmed trajectories, from `load_recordings`.
-        lens: Lens and pose of the real camera, from `Device.lens`.
-        pinhole: The simulated camera that defines the view, from `Sensor.camera`.
-        resolution: Height and width of the rectified images (pixels).
-        progress: Called after each trajectory, with the number of trajectories so far and of all.
-    """
-    width, height = recordings.origin.width, recordings.origin.height
-    if (width, height) != (lens.width, lens.height):
-        raise ValueError(
-            f"{recordings.folder} has images of {width}x{height} pixels, but the lens belongs to images of "
-            f"{lens.width}x{lens.height} pixels: use the sensor file of the device that took the images"
-        )
-    return recordings.images(lambda image: rectified(lens, pinhole, image, resolution), progress)

@@ -121,11 +121,6 @@ class STS:
                 all USB ports for the controller's serial number.
             timeout_s: Longest wait for one image (s), not counting the time of a reconnection.
             reconnect_s: Longest search for a controller that was lost (s).
-
-        Raises:
-            SensorFileError: The file is damaged, or has no description of a camera and lights.
-            WrongDeviceError: The camera is not the camera that the file names. `connect` raises the same error for the
-                LED controller.
         """
         device = Device.load(path)
         config = camera if isinstance(camera, CameraConfig) else device.camera_config(camera)
@@ -171,7 +166,7 @@ class STS:
             LedError: The controller cannot be opened, or does not answer.
             CameraError: The camera cannot be opened, sends no frames, or does not accept the `exposures`.
             LightError: The lights do not change the image, or it keeps changing.
-            WrongDeviceError: The LED controller is not the controller that the sensor file names.
+            ValueError: The LED controller is not the controller that the sensor file names.
         """
         if self._leds is None:
             if self.device is not None and not self._port:

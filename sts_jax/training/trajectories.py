@@ -69,7 +69,7 @@ def image_arrays(
     """Make the training arrays of an `mvae` model from images without poses, as from a real sensor.
 
     Args:
-        visual: First and last visual image of each trajectory, for example from `hardware.recorded_images`.
+        visual: First and last visual image of each trajectory, for example from `hardware.Recordings.images`.
         tactile: First and last tactile image of each trajectory.
         modalities: Modalities of the model, one or both of `visual` and `tactile`.
         preprocessing: Detects contacts in tactile images. For images of a camera, from `touch_of_noisy_images`.
