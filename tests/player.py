@@ -16,7 +16,7 @@ class Player:
 
     def __init__(self, peer):
         self.peer, self.count = peer, 0
-        peer.camera.numbered, peer.camera.noise = False, 1.0
+        peer.camera.numbered = False
 
     @staticmethod
     def start(number):

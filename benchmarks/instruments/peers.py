@@ -346,7 +346,7 @@ class SeenLights(MotionJpeg):
         self.lights, self.lag_s, self.exposure_s = lights, lag_s, exposure_s
         self.log: dict[int, Exposure] = {}  # exposure of each frame, by the number of the frame
         self.blind = False  # True: frames do not show the light
-        self.numbered = True  # True: frames show their number
+        self.numbered = True  # True: frames show their number. False: pixel noise of 1 of 255 makes them different
         self.moving = False  # True: a black disc moves through the frames
         self.spot: tuple[int, int, int] | None = None  # column, row and radius of a dark object (pixels)
         super().__init__(fps=fps, size=size)
@@ -367,6 +367,9 @@ class SeenLights(MotionJpeg):
         spot = self.spot
         if spot is not None:
             cv2.circle(image, spot[:2], spot[2], (30, 30, 30), -1)
+        if not self.numbered:
+            noise = np.random.default_rng(self.number).normal(0, 1, image.shape)
+            image = np.clip(image + noise, 0, 255).astype(np.uint8)
         return jpeg(image)
 
     def exposure_of(self, image: Image) -> Exposure | None:
