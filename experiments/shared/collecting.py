@@ -25,7 +25,7 @@ class Collect:
     """Guide a person through trajectories, and save images of the held object, and of the object at rest."""
 
     workdir: Folder = Path("runs/real")  # work directory. The trajectories go to its folder `dataset`
-    camera: str | None = None  # path or URL of the camera, or a video file. None: the camera of the sensor file
+    camera: str | None = None  # path or URL of the camera. None: the camera of the sensor file
     leds: str | None = None  # serial port of the LED controller. None: found by the serial number in the sensor file
     twin: bool = False  # use the digital twin instead of devices. Nobody needs to act, and there is no page
     seed: int = 0  # seed of the twin's object and trajectories
