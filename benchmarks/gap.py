@@ -234,11 +234,9 @@ def main(args: Args) -> None:
         raise ValueError(f"--resolution must have the aspect ratio {SIZE[0]}:{SIZE[1]}, got {height} x {width}")
     if args.out is not None:
         drawing.make_folder(args.out.parent)
-    recordings = sessions(args)
-    images = recordings.images()
-    visual = np.stack([images.initial_visual, images.final_visual], 1).reshape(-1, *SIZE, 3)
-    tactile = np.stack([images.initial_tactile, images.final_tactile], 1).reshape(-1, *SIZE, 3)
-    clean = gap.Streams(visual, tactile, np.repeat(np.array(recordings.numbers), 2))
+    images = sessions(args).images()
+    visual, tactile = (stream.reshape(-1, *SIZE, 3) for stream in (images.visual, images.tactile))
+    clean = gap.Streams(visual, tactile, np.repeat(images.number, 2))
     lines = [f"{args.trajectories} trajectories, compared at {height} x {width} pixels, MAE of 255"]
     print(lines[0], flush=True)
     for line in table(clean, args.resolution):

@@ -260,14 +260,14 @@ def sides(case: Case, num: int) -> dict[str, np.ndarray]:
         f"{case.name}: {len(first)} runs a side, unsettled {100 * np.mean(~ours.settled):.1f} %, drawn again "
         f"{', '.join(f'{int(traj.resampled.sum())} ({name})' for name, traj in rolled.items())}"
     )
-    ends = {name: traj.pose[:, -1] for name, traj in rolled.items()}
+    ends: dict[str, Array | np.ndarray] = {name: traj.pose[:, -1] for name, traj in rolled.items()}
     ends["C MuJoCo"] = last_in_c(case, ours)
     ends["C, every vertex"] = last_in_c(case, ours, every_vertex=True)
     if ours.condition.shape[1]:
         ends["C, every vertex, driven pad"] = last_in_c(case, ours, every_vertex=True, driven=True)
     label = jax.vmap(case.label)
     starts = {name: traj.pose[:, 0] for name, traj in rolled.items()}
-    return {name: np.asarray(label(starts.get(name, first), last)) for name, last in ends.items()}
+    return {name: np.asarray(label(starts.get(name, first), jnp.asarray(last))) for name, last in ends.items()}
 
 
 def compare(found: dict[str, np.ndarray], labels: Sequence[str], margin: float = MARGIN) -> bool:

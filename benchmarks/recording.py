@@ -59,34 +59,32 @@ def measure(name: str, folder: Path, count: int, write: Callable[[int], object])
     print(f"  {name:28s}  {size / 1e6:5.2f} MB  {statistics.median(times):5.0f} ms, at most {max(times):5.0f} ms")
 
 
+def measure_disk(folder: Path, taken: Pair, count: int) -> None:
+    """Measure the writing of a pair, and of an image in each encoding."""
+
+    def write_pair(number: int) -> None:
+        storage.write_folder(folder / "session" / str(number), session.encoded_pair(taken), {})
+
+    measure("pair of a session", folder / "session", count, write_pair)
+    height, width = taken.visual.image.shape[:2]
+    for encoding in get_args(recording.Encoding):
+        origin = Origin("camera", "leds", width, height, (255,) * 4)
+        with Recorder(folder / encoding, origin, encoding=encoding) as recorder:
+
+            def add(number: int, recorder: Recorder = recorder) -> None:
+                recorder.add(dataclasses.replace(taken.visual, time_s=0.05 * number))
+
+            measure(f"image of a recording, {encoding}", folder / encoding, count, add)
+
+
 def main(args: Args) -> None:
     """Measure each size in SIZES, without and with noise."""
     random = np.random.default_rng(args.seed)
     for width, height in SIZES:
         for noise in (0.0, 1.5):
             print(f"{width} x {height}, noise {noise}")
-            taken = pair(random, width, height, noise)
             with tempfile.TemporaryDirectory(dir=args.folder) as temporary:
-                folder = Path(temporary)
-                measure(
-                    "pair of a session",
-                    folder / "session",
-                    args.pairs,
-                    lambda number, folder=folder, taken=taken: storage.write_folder(
-                        folder / "session" / str(number), session.encoded_pair(taken), {}
-                    ),
-                )
-                for encoding in get_args(recording.Encoding):
-                    origin = Origin("camera", "leds", width, height, (255,) * 4)
-                    with Recorder(folder / encoding, origin, encoding=encoding) as recorder:
-                        measure(
-                            f"image of a recording, {encoding}",
-                            folder / encoding,
-                            args.pairs,
-                            lambda number, recorder=recorder, shot=taken.visual: recorder.add(
-                                dataclasses.replace(shot, time_s=0.05 * number)
-                            ),
-                        )
+                measure_disk(Path(temporary), pair(random, width, height, noise), args.pairs)
 
 
 if __name__ == "__main__":

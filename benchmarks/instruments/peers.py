@@ -375,7 +375,7 @@ class SeenLights(MotionJpeg):
     def exposure_of(self, image: Image) -> Exposure | None:
         """Look up an image's exposure by the frame number in its corner."""
         if image.shape[1::-1] != self.size or image.max() < DARK / 2:
-            return
+            return None
         return self.log.get(number_of(image[:CORNER, :CORNER]))
 
 
