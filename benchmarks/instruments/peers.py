@@ -274,7 +274,7 @@ class Peer:
             "cut": reply[: len(reply) // 2],
             "joined": reply[:-1] + reply,
             "noise": b"\xff\x00\xfe\n" + reply,
-            "watchdog": protocol.encode_reply(protocol.TurnedOff(77)) + reply,
+            "watchdog": protocol.encode_reply(protocol.TurnedOff(0, 77)) + reply,
             "stale": protocol.encode_reply(protocol.State(65535, (9, 9, 9, 9), 9, 9)) + reply,
         }
         return held + sent.get(fault, reply)

@@ -120,7 +120,6 @@ class CameraConfig:
     focus: float | None = None  # focus in the driver's unit, None: its value after the warm-up
     timeout_s: float = 5.0  # longest wait for the opening of the source and for each frame (s)
     buffer: int = 1  # number of frames kept for `async_read`. If one more arrives, the oldest is discarded
-    in_flight: int = 2  # number of frames that may be in exposure or transfer at once. `read` discards as many frames
     frozen_after_s: float | None = 1.0  # time of identical frames after which reading raises an error (s), None: never
 
     def __post_init__(self) -> None:
@@ -130,10 +129,10 @@ class CameraConfig:
             raise ValueError("source is empty: give a device's index, a path or a URL")
         if (self.width is None) != (self.height is None):
             raise ValueError(f"width and height must both be given or both be None, got {self.width} x {self.height}")
-        for name, least in (("width", 1), ("height", 1), ("buffer", 1), ("in_flight", 0)):
+        for name in ("width", "height", "buffer"):
             value = getattr(self, name)
-            if value is not None and value < least:
-                raise ValueError(f"{name} must be >= {least}, got {value}")
+            if value is not None and value < 1:
+                raise ValueError(f"{name} must be >= 1, got {value}")
         for name in ("fps", "timeout_s", "frozen_after_s"):
             value = getattr(self, name)
             if value is not None and not (value > 0 and math.isfinite(value)):
@@ -142,25 +141,19 @@ class CameraConfig:
             raise ValueError(f"fourcc must have four characters, such as 'MJPG', got {self.fourcc!r}")
 
     @property
-    def target(self) -> int | str:
-        """The source as an index, a path or a URL."""
-        text = str(self.source)
-        return int(text) if text.isdecimal() else text
-
-    @property
     def kind(self) -> Literal["device", "stream"]:
         """The kind of the source."""
-        return "stream" if isinstance(self.target, str) and _URL.match(self.target) else "device"
+        return "stream" if _URL.match(str(self.source)) else "device"
 
     @property
     def path(self) -> str:
         """The path of the device, or the URL of the stream."""
-        return f"/dev/video{self.target}" if isinstance(self.target, int) else self.target
+        return f"/dev/video{self.source}" if str(self.source).isdecimal() else str(self.source)
 
     @property
     def name(self) -> str:
         """The name of the source in messages, without the user name and the password of a URL."""
-        return f"camera {self.target}" if isinstance(self.target, int) else public(self.target)
+        return f"camera {self.source}" if str(self.source).isdecimal() else public(self.path)
 
 
 def public(url: str) -> str:
@@ -169,8 +162,6 @@ def public(url: str) -> str:
 
 
 class _Gap(NamedTuple):
-    """A long interval between two frames, after which frames are missing."""
-
     start_s: float  # time of the frame before the interval
     frames: int  # number of frames since this time
     missing: int  # number of missing frames
@@ -180,8 +171,8 @@ class _Gap(NamedTuple):
 class Pace:
     """Measures the period of a camera's frames, and estimates how many frames were lost.
 
-    After an interval of n + 1 periods, n frames count as lost. If the next frames follow each other in less than one
-    period, some of them were only late, and `dropped` is reduced by their number.
+    After an interval of n + 1 periods, n frames count as lost. Frames that follow in less than one period were only
+    late, and reduce `dropped`.
     """
 
     def __init__(self, nominal: float | None):
@@ -245,16 +236,10 @@ class FoundCamera:
 
 
 def find_cameras(root: Path = Path("/")) -> list[FoundCamera]:
-    """List the V4L2 cameras of this machine. The list is empty on other systems than Linux.
+    """List the V4L2 cameras of this machine by number. The list is empty on other systems than Linux.
 
     The `source` of a camera is its path in `/dev/v4l/by-id`, which contains the serial number, else its path in
     `/dev/v4l/by-path`, which contains the USB port, else the path of the device itself.
-
-    Args:
-        root: Folder that contains the system's folders `dev` and `sys`. Only tests pass another folder.
-
-    Returns:
-        The cameras, in the order of the numbers in `/dev/video0`, `/dev/video1` and so on.
     """
     links: dict[Path, Path] = {}
     for folder in ("by-id", "by-path"):
@@ -267,11 +252,6 @@ def find_cameras(root: Path = Path("/")) -> list[FoundCamera]:
             source = links.get(device.resolve(), device)
             cameras.append(FoundCamera(str(source), _text(properties / "name") or "unnamed"))
     return cameras
-
-
-def cameras_found() -> str:
-    """List the cameras of this machine in a sentence for error messages."""
-    return f"Cameras found: {', '.join(map(str, find_cameras())) or 'none'}."
 
 
 def stable_path(device: str, root: Path = Path("/")) -> str:

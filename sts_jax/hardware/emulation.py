@@ -2,14 +2,6 @@
 
 from sts_jax.hardware import protocol
 
-_TEXTS = {
-    protocol.Code.CHECKSUM: "checksum",
-    protocol.Code.COMMAND: "command",
-    protocol.Code.ARGUMENTS: "arguments",
-    protocol.Code.VERSION: f"protocol {protocol.VERSION}",
-    protocol.Code.LENGTH: "length",
-}
-
 
 class EmulatedController:
     """An emulated LED controller without a clock: each call passes the current time. Not thread-safe."""
@@ -43,7 +35,7 @@ class EmulatedController:
         if self.levels == protocol.DARK or now_s - self._valid_s < self.watch_ms / 1000:
             return b""
         self._apply(protocol.DARK)
-        return protocol.encode_reply(protocol.TurnedOff(self.counter))
+        return protocol.encode_reply(protocol.TurnedOff(0, self.counter))
 
     def _answer(self, line: bytes, now_s: float) -> bytes:
         """The reply to one line. A repeated line gets the same reply again and is not executed."""
@@ -53,7 +45,8 @@ class EmulatedController:
         try:
             reply = protocol.encode_reply(self._execute(protocol.decode_request(line), now_s))
         except protocol.ProtocolError as error:
-            return protocol.encode_reply(protocol.Refused(error.sequence, error.code, _TEXTS[error.code]))
+            text = f"protocol {protocol.VERSION}" if error.code is protocol.Code.VERSION else error.code.name.lower()
+            return protocol.encode_reply(protocol.Refused(error.sequence, error.code, text))
         self._valid_s = now_s
         self._answered = line, reply
         return reply
@@ -73,7 +66,7 @@ class EmulatedController:
                 return protocol.State(sequence, self.levels, self.counter, self.boot, uptime_ms)
             case protocol.Watch(sequence, period_ms):
                 self.watch_ms = period_ms
-                return protocol.Watching(sequence, period_ms)
+                return request
 
     def _apply(self, levels: protocol.Levels) -> None:
         if levels != self.levels:

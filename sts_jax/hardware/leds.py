@@ -11,7 +11,6 @@ import random
 import threading
 import time
 from collections.abc import Callable, Sequence
-from types import TracebackType
 from typing import TypeVar
 
 import serial
@@ -28,7 +27,7 @@ _LONGEST_WAIT_S = 5.0
 
 _log = logging.getLogger(__name__)
 
-Answer = TypeVar("Answer", protocol.Controller, protocol.State, protocol.Watching)
+Answer = TypeVar("Answer", protocol.Controller, protocol.State, protocol.Watch)
 
 
 class LedError(OSError):
@@ -65,10 +64,7 @@ def find_controllers() -> list[Port]:
 
 @dataclasses.dataclass(frozen=True)
 class Lit:
-    """The controller's answer to a request: the levels of the lights at some time between two times.
-
-    Both times are on the clock `time.monotonic`.
-    """
+    """The controller's answer: the levels of the lights at some time between two times on `time.monotonic`."""
 
     levels: protocol.Levels  # duty cycles of the four light channels, 0 to 255
     counter: int  # number of changes of the levels since the controller booted
@@ -96,24 +92,14 @@ class Leds:
 
     A request takes at most `answer_s`, and 0.3 s more if the port accepts no bytes or sends bytes without end. The
     first request after a restart of the controller takes at most twice as long.
-
-    Attributes:
-        port: Name of the serial port.
-        controller: Description of the controller: its firmware, its board and its serial number.
     """
 
-    def __init__(self, port: str, *, baud: int, timeout_s: float, answer_s: float, watchdog_ms: int):
+    def __init__(
+        self, connection: "Connection", *, answer_s: float = 1.0, watchdog_ms: int = protocol.DEFAULT_WATCH_MS
+    ):
         """Use `Leds.connect`."""
-        self.port = port
-        self._baud = baud
-        self._timeout_s = timeout_s
         self._answer_s = answer_s
         self._watchdog_ms = watchdog_ms
-        self._usb = _usb_port(port)
-        self._thread: threading.Thread | None = None
-        self._boot: int | None = None
-        self._open = False
-        connection, self.controller = self._handshake(port)
         self._start(connection)
 
     @classmethod
@@ -121,7 +107,6 @@ class Leds:
         cls,
         port: str,
         *,
-        baud: int = protocol.BAUD,
         timeout_s: float = 5.0,
         answer_s: float = 1.0,
         watchdog_ms: int = protocol.DEFAULT_WATCH_MS,
@@ -130,7 +115,6 @@ class Leds:
 
         Args:
             port: Name of the device, such as `/dev/ttyACM0`, or a URL of pyserial.
-            baud: Rate of the serial line (baud). The firmware uses 115200.
             timeout_s: Longest wait for the controller's first answer (s).
             answer_s: Longest time of each later request, with all its repetitions (s).
             watchdog_ms: Time without requests after which the controller turns its lights off, 100 to 10000 (ms).
@@ -142,33 +126,27 @@ class Leds:
         for name, value in (("timeout_s", timeout_s), ("answer_s", answer_s)):
             if not 0 < value < float("inf"):
                 raise ValueError(f"{name} must be positive and finite, got {value}")
-        return cls(port, baud=baud, timeout_s=timeout_s, answer_s=answer_s, watchdog_ms=watchdog_ms)
+        return cls(Connection(port, timeout_s), answer_s=answer_s, watchdog_ms=watchdog_ms)
 
     @classmethod
-    def find(cls, serial_number: str, *, timeout_s: float = 5.0) -> "Leds":
+    def find(cls, serial_number: str) -> "Leds":
         """Open the USB ports one after the other until the controller with a serial number answers.
 
-        Args:
-            serial_number: Serial number of the controller, as `Leds.serial_number` returns it. Some boards have it in
-                their USB descriptor, too. Their ports are tried first.
-            timeout_s: Longest wait for an answer on each port (s).
+        Some boards have the serial number in their USB descriptor, too. Their ports are tried first.
         """
-        tried = {}
-        candidates = [port for port in find_controllers() if port.vendor is not None]
-        for port in sorted(candidates, key=lambda port: port.serial_number != serial_number):
-            try:
-                leds = cls.connect(port.device, timeout_s=timeout_s)
-            except LedError as error:
-                tried[port.device] = str(error)
-                continue
-            if leds.serial_number == serial_number:
-                return leds
-            tried[port.device] = f"controller {leds.serial_number}"
-            leds.close()
-        raise LedError(
-            f"LED controller {serial_number} was not found on any USB port: connect it, or pass the name of another "
-            f"port (the argument `leds` of `STS.from_file`). {_listed(tried)}"
-        )
+        ports = [port for port in find_controllers() if port.vendor is not None]
+        ports.sort(key=lambda port: port.serial_number != serial_number)
+        return cls(_search([port.device for port in ports], serial_number, timeout_s=5.0))
+
+    @property
+    def port(self) -> str:
+        """Name of the serial port."""
+        return self._connection.name
+
+    @property
+    def controller(self) -> protocol.Controller:
+        """Description of the controller: its firmware, its board and its serial number."""
+        return self._connection.controller
 
     @property
     def serial_number(self) -> str:
@@ -197,9 +175,8 @@ class Leds:
 
     def close(self) -> None:
         """Turn the lights off and close the port. Without an answer, the controller's watchdog turns them off."""
-        if not self._open:
+        if self._connection.stopped.is_set():
             return
-        self._open = False
         try:
             self.set(protocol.DARK)
         except LedError as error:
@@ -218,64 +195,41 @@ class Leds:
         """
         self._stop()
         deadline, wait = time.monotonic() + limit_s, _FIRST_WAIT_S
+        last = self._connection
         while True:
-            tried = {}
-            for name in self._candidates():
-                try:
-                    connection, controller = self._handshake(name)
-                    if controller.serial_number != self.serial_number:
-                        connection.close()
-                        tried[name] = f"controller {controller.serial_number}"
-                        continue
-                    self.port, self.controller, self._boot = name, controller, None
-                    self._usb = _usb_port(name) or self._usb
-                    self._start(connection)
-                    return
-                except LedError as error:
-                    tried[name] = str(error)
-            if time.monotonic() + wait > deadline:
-                raise DisconnectedError(
-                    f"LED controller {self.serial_number} was not found within {limit_s:g} s: check its cable. "
-                    f"{_listed(tried)}"
-                )
+            try:
+                connection = _search(self._candidates(), self.serial_number, last.timeout_s)
+                connection.usb = connection.usb or last.usb
+                self._start(connection)
+                return
+            except LedError as error:
+                if time.monotonic() + wait > deadline:
+                    raise DisconnectedError(f"{error} The search took {limit_s:g} s.") from error
             time.sleep(wait)
             wait = min(2 * wait, _LONGEST_WAIT_S)
 
     def __enter__(self) -> "Leds":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
-
-    def _handshake(self, port: str) -> tuple["Connection", protocol.Controller]:
-        connection = Connection(port, self._baud)
-        try:
-            return connection, connection.handshake(self._timeout_s)
-        except BaseException:
-            connection.close()
-            raise
 
     def _start(self, connection: "Connection") -> None:
         """Turn the lights off, and start the background thread of requests."""
         self._connection = connection
+        self._boot: int | None = None
+        self._thread = threading.Thread(target=self._keep_alive, name=f"keep-alive of {self.port}", daemon=True)
         try:
             self.set(protocol.DARK)
         except BaseException:
             connection.close()
             raise
-        self._open = True
-        self._thread = threading.Thread(
-            target=self._keep_alive, args=(connection,), name=f"keep-alive of {self.port}", daemon=True
-        )
         self._thread.start()
 
     def _stop(self) -> None:
         self._connection.close()
-        if self._thread is not None:
+        if self._thread.ident is not None:  # it was started
             self._thread.join()
-            self._thread = None
 
     def _state(self, request: Callable[[int], protocol.Request]) -> Lit:
         """Send a request whose reply is a `State`. If the controller has rebooted, set the watchdog's period again."""
@@ -283,14 +237,14 @@ class Leds:
         reply, sent_s, acknowledged_s = connection.exchange(request, protocol.State, timeout_s=self._answer_s)
         if reply.boot != self._boot:
             period = functools.partial(protocol.Watch, period_ms=self._watchdog_ms)
-            connection.exchange(period, protocol.Watching, timeout_s=self._answer_s)
+            connection.exchange(period, protocol.Watch, timeout_s=self._answer_s)
             self._boot = reply.boot
         return Lit(reply.levels, reply.counter, reply.boot, sent_s, acknowledged_s)
 
-    def _keep_alive(self, connection: "Connection") -> None:
+    def _keep_alive(self) -> None:
         """Send a request whenever a third of the watchdog's period has passed without one."""
-        period_s = self._watchdog_ms / 3000
-        wait = period_s
+        connection = self._connection
+        wait = period_s = self._watchdog_ms / 3000
         while not connection.stopped.wait(wait):
             wait = period_s - (time.monotonic() - connection.answered_s)
             if wait > 0:
@@ -298,53 +252,69 @@ class Leds:
             wait = period_s
             try:
                 self.ping()
-            except DisconnectedError as error:
-                _log.warning("%s", error)
-                return
             except LedError as error:
                 _log.warning("%s", error)
+                if isinstance(error, DisconnectedError):
+                    return
                 wait = 0.0
 
     def _candidates(self) -> list[str]:
         """The names of the ports on which `reconnect` searches for the controller, in order."""
         names = [self.port]
-        if (usb := self._usb) is not None:
+        if (usb := self._connection.usb) is not None:
             alike = [port for port in find_controllers() if (port.vendor, port.product) == (usb.vendor, usb.product)]
             alike.sort(key=lambda port: port.serial_number != usb.serial_number)
             names += [port.device for port in alike]
         return list(dict.fromkeys(names))
 
 
+def _search(ports: Sequence[str], serial_number: str, timeout_s: float) -> "Connection":
+    """Connect to the first port whose controller has a serial number."""
+    tried = []
+    for port in ports:
+        try:
+            connection = Connection(port, timeout_s)
+        except LedError as error:
+            tried.append(f"{port} ({error})")
+            continue
+        if connection.controller.serial_number == serial_number:
+            return connection
+        connection.close()
+        tried.append(f"{port} (controller {connection.controller.serial_number})")
+    raise LedError(
+        f"LED controller {serial_number} was not found: check its cable, or name a port that is not a USB port (the "
+        f"argument `leds` of `STS.from_file`). Ports tried: {', '.join(tried) or 'none'}."
+    )
+
+
 class Connection:
     """An open serial port to the LED controller. Several threads may use one connection."""
 
-    def __init__(self, name: str, baud: int):
-        """Open the port."""
-        self.name = name
-        self.baud = baud
+    def __init__(self, name: str, timeout_s: float):
+        """Open the port, and wait for at most `timeout_s` for the description of the controller."""
+        self.name, self.timeout_s = name, timeout_s
+        self.usb = _usb_port(name)
         self.answered_s = time.monotonic()  # time of the last valid answer (s)
         self.stopped = threading.Event()  # set by `close`
-        self._serial = _open_port(name, baud)
+        self._serial = _open_port(name)
         self._lock = threading.Lock()
         # Random, so that late answers to an earlier process have other sequence numbers.
         self._sequence = random.randrange(protocol.LAST_SEQUENCE)
         self._buffer = b""  # received bytes that are not processed yet
         self._heard = b""  # invalid lines that arrived during the current exchange
-
-    def handshake(self, timeout_s: float) -> protocol.Controller:
-        """Ask the controller for its description, and check its version of the protocol."""
         try:
-            reply, _, _ = self.exchange(protocol.Hello, protocol.Controller, timeout_s=timeout_s)
+            self.controller, _, _ = self.exchange(protocol.Hello, protocol.Controller, timeout_s=timeout_s)
+            if self.controller.version != protocol.VERSION:
+                raise LedError(
+                    f"the LED controller on {name} uses version {self.controller.version} of the protocol instead of "
+                    f"{protocol.VERSION}. {_FLASH}"
+                )
         except LedTimeoutError as error:
-            raise LedError(
-                f"no LED controller answered on {self.name} within {timeout_s:g} s. {self._description()}"
-            ) from error
-        if reply.version != protocol.VERSION:
-            raise LedError(
-                f"the LED controller on {self.name} uses version {reply.version} of the protocol instead of "
-                f"{protocol.VERSION}. {_FLASH}"
-            )
-        return reply
+            self.close()
+            raise LedError(f"no LED controller answered on {name}: {error}") from error
+        except BaseException:
+            self.close()
+            raise
 
     def exchange(
         self, request: Callable[[int], protocol.Request], answer: type[Answer], *, timeout_s: float
@@ -352,11 +322,6 @@ class Connection:
         """Send a request, and repeat it with the same sequence number every 0.1 s until its answer arrives.
 
         The controller executes it only once. Damaged lines and answers to other requests are ignored.
-
-        Args:
-            request: Function that makes the request from its sequence number.
-            answer: Type of the expected answer.
-            timeout_s: Longest wait for the answer, including all repetitions (s).
 
         Returns:
             The answer, the time before the request was first sent, and the time of the answer (`time.monotonic`, s).
@@ -371,20 +336,20 @@ class Connection:
                 self._write(line)
                 until = min(deadline, now + REPEAT_S)
                 while (reply := self._next_reply(until)) is not None:
-                    if isinstance(reply, protocol.Refused) and reply.sequence in (0, self._sequence):
-                        if reply.sequence == 0:  # the request was damaged on its way, so it is sent again
-                            break
-                        raise LedError(
-                            f"the LED controller on {self.name} refused the request {line.decode().strip()!r}: "
-                            f"{reply.text}. {_FLASH}"
-                        )
-                    if isinstance(reply, answer) and reply.sequence == self._sequence:
+                    if isinstance(reply, protocol.Refused) and reply.sequence == 0:
+                        break  # the request was damaged on its way, so it is sent again
+                    if reply.sequence != self._sequence:
+                        continue
+                    if isinstance(reply, protocol.Refused):
+                        raise LedError(f"the LED controller on {self.name} refused {line!r}: {reply.text}. {_FLASH}")
+                    if isinstance(reply, answer):
                         self.answered_s = time.monotonic()
                         return reply, sent_s, self.answered_s
-            raise LedTimeoutError(
-                f"the LED controller on {self.name} gave no valid answer to the request "
-                f"{line.decode().strip()!r} within {timeout_s:g} s. {self._description()}"
-            )
+            heard = self._heard + self._buffer
+            hint = "Nothing was received: check the cable and the name of the port, and flash the firmware."
+            if heard:
+                hint = f"Received {heard[:80]!r}: another device may be on this port."
+            raise LedTimeoutError(f"no valid answer to {line!r} from {self.name} within {timeout_s:g} s. {hint}")
 
     def close(self) -> None:
         """Close the port. No more requests arrive, so the controller's watchdog turns the lights off."""
@@ -413,28 +378,19 @@ class Connection:
         return None
 
     def _next_line(self, until: float) -> bytes | None:
-        """The next line that is not empty, or None if none arrives until a time.
-
-        Bytes without a newline are returned once they are longer than any valid line.
-        """
-        expired = False
+        """The next line that is not empty, or more bytes than a line may have, or None if none arrives until a time."""
         while True:
-            line, newline, rest = self._buffer.partition(b"\n")
-            if newline or len(line) > protocol.LONGEST_LINE:
-                self._buffer = rest
-                if line:
-                    return line + newline
-                continue
+            expired = time.monotonic() >= until  # read once more, in case this process was suspended meanwhile
+            try:
+                self._buffer += self._serial.read_until(b"\n", protocol.LONGEST_LINE + 1)
+            except (OSError, TypeError) as error:  # TypeError: pyserial reads from a port that was closed meanwhile
+                raise self._vanished(error) from error
+            if self._buffer.endswith(b"\n") or len(self._buffer) > protocol.LONGEST_LINE:
+                line, self._buffer = self._buffer, b""
+                if line != b"\n":
+                    return line
             if expired:
                 return None
-            expired = time.monotonic() >= until  # read once more, in case this process was suspended meanwhile
-            self._buffer += self._read()
-
-    def _read(self) -> bytes:
-        try:
-            return self._serial.read(max(1, self._serial.in_waiting))
-        except (OSError, TypeError) as error:  # TypeError: pyserial reads from a port that was closed meanwhile
-            raise self._vanished(error) from error
 
     def _write(self, line: bytes) -> None:
         # pyserial also reports a timeout for a line that it has sent, if the operating system suspended the process in
@@ -447,19 +403,7 @@ class Connection:
             raise self._vanished(error) from error
 
     def _vanished(self, error: Exception) -> DisconnectedError:
-        return DisconnectedError(
-            f"the port {self.name} is gone or closed ({error}): check the cable, then call `reconnect()`."
-        )
-
-    def _description(self) -> str:
-        """What was received instead of an answer, for an error message."""
-        heard = self._heard + self._buffer
-        if not heard:
-            return "Nothing was received: check the cable and the name of the port, and flash the firmware."
-        return (
-            f"Received {heard[:80]!r}: another device may be on this port, or the baud rate ({self.baud}) is not that "
-            f"of the firmware ({protocol.BAUD})."
-        )
+        return DisconnectedError(f"the port {self.name} is gone or closed ({error}): check the cable, and reconnect().")
 
 
 _FLASH = "Flash the firmware of this version of sts_jax with `make flash PORT=...` in sts_jax/hardware/firmware."
@@ -470,10 +414,12 @@ _CAUSES = {
 _CAUSES |= {errno.EPERM: _CAUSES[errno.EACCES], errno.EBUSY: _CAUSES[errno.EAGAIN]}
 
 
-def _open_port(name: str, baud: int) -> serial.Serial:
+def _open_port(name: str) -> serial.Serial:
     """Open a port, and lock it against other programs that use pyserial's exclusive mode."""
     try:
-        return serial.serial_for_url(name, baudrate=baud, timeout=READ_S, write_timeout=WRITE_S, exclusive=True)
+        return serial.serial_for_url(
+            name, baudrate=protocol.BAUD, timeout=READ_S, write_timeout=WRITE_S, exclusive=True
+        )
     except (OSError, ValueError) as error:
         cause = _CAUSES.get(getattr(error, "errno", None) or 0, str(error))
         ports = ", ".join(f"{port.device} ({port.description})" for port in find_controllers()) or "none"
@@ -488,10 +434,6 @@ def _usb_port(name: str) -> Port | None:
             if port.vendor is not None and os.path.realpath(port.device) == target:
                 return port
     return None
-
-
-def _listed(tried: dict[str, str]) -> str:
-    return f"Ports tried: {', '.join(f'{name} ({result})' for name, result in tried.items()) or 'none'}."
 
 
 def checked_levels(levels: Sequence[int]) -> protocol.Levels:

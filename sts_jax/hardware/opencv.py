@@ -11,7 +11,6 @@ import time
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import cv2
@@ -28,7 +27,7 @@ from sts_jax.hardware.camera import (
     FrozenCameraError,
     Pace,
     StaleFrameError,
-    cameras_found,
+    find_cameras,
     public,
     stable_path,
 )
@@ -36,6 +35,7 @@ from sts_jax.hardware.camera import (
 FIRST_WAIT_S = 0.25  # s, wait before a lost source is opened again. It doubles after each failure
 LONGEST_WAIT_S = 5.0  # s, longest of these waits
 
+_IN_FLIGHT = 2  # frames that may be in exposure or transfer at once. `read` discards as many
 _MJPG = cv2.VideoWriter.fourcc(*"MJPG")
 _TAIL = 1024  # bytes within which a complete JPEG image ends with its marker
 _RATE_TOLERANCE = 0.02  # share by which a driver may round the frame rate
@@ -53,15 +53,15 @@ _TOLERANCE = 0.5  # largest difference that counts as accepted, because drivers 
 Image = UInt8[np.ndarray, "height width 3"]
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class CameraStatistics:
     """Counts of frames since `OpenCVCamera.connect`."""
 
-    frames: int  # frames that were complete, of the right size and not frozen
-    dropped: int  # frames that camera or driver lost, estimated from the times
-    skipped: int  # frames that were replaced by newer frames before they were read
-    damaged: int  # frames that could not be decoded
-    rate: float | None  # frames per second, from the median interval of recent frames. None: not measured yet
+    frames: int = 0  # frames that were complete, of the right size and not frozen
+    dropped: int = 0  # frames that camera or driver lost, estimated from the times
+    skipped: int = 0  # frames that were replaced by newer frames before they were read
+    damaged: int = 0  # frames that could not be decoded
+    rate: float | None = None  # frames per second, from the median interval of recent frames. None: not measured yet
 
 
 class OpenCVCamera:
@@ -90,12 +90,14 @@ class OpenCVCamera:
         self._queue: collections.deque[Captured] = collections.deque()
         self._newest: Captured | None = None
         self._problem: tuple[type[CameraError], str] | None = None  # why there are no frames at present
-        self._counts: collections.Counter[str] = collections.Counter()
+        self._counts = CameraStatistics()
         self._pace = Pace(self.config.fps)
         self._next = 0  # sequence number of the next frame
         self._epoch = -1
         self._task: Callable[[Capture], None] | None = None  # to be done on the open device after the next frame
-        self._held = requested(self.config) if self.config.kind == "device" else {}  # locked settings
+        # Locked settings, by field of `CameraConfig`. At first, these are the requested ones
+        wanted = {field: getattr(self.config, field) for field, *_ in _SETTINGS if self.config.kind == "device"}
+        self._held: dict[str, float] = {field: value for field, value in wanted.items() if value is not None}
         self._refused: list[str] = []  # settings that the driver did not accept
 
     def connect(self, warmup_s: float = 1.0) -> "OpenCVCamera":
@@ -109,44 +111,37 @@ class OpenCVCamera:
         self._thread.start()
         atexit.register(self.disconnect)  # a thread that is inside OpenCV must not outlive the interpreter
         try:
-            limit_s = 3 * config.timeout_s
             with self._changed:
-                self._changed.wait_for(lambda: self._newest is not None or self._problem is not None, limit_s)
+                self._changed.wait_for(lambda: self._newest or self._problem, 3 * config.timeout_s)
                 if self._newest is None:
-                    raise self._error(limit_s)
+                    raise self._error(3 * config.timeout_s)
             time.sleep(warmup_s)
             if config.kind == "device" and config.lock:
-                self._between_frames(self._lock_settings)
+                self._between_frames(self._lock_all)
                 with self._changed:
                     self._queue.clear()
+            elif config.lock:
+                self._refused.append(
+                    "AUTO_EXPOSURE and AUTO_WB of a stream cannot be turned off from here: lock exposure and white "
+                    "balance at its server, then pass lock=False in CameraConfig"
+                )
             for text in self._refused:
                 warnings.warn(f"{config.name} did not accept a setting. {text}.", stacklevel=2)
-            if config.kind == "stream" and config.lock:
-                warnings.warn(
-                    f"{config.name} is a stream, so AUTO_EXPOSURE and AUTO_WB cannot be turned off from here: lock "
-                    "exposure and white balance at its server, then pass lock=False in CameraConfig.",
-                    stacklevel=2,
-                )
         except BaseException:  # includes a warning that Python turns into an error
-            self._end()
+            self.disconnect()
             raise
         return self
 
     def disconnect(self) -> None:
         """Close the camera. A driver that does not respond for `timeout_s` closes it later, which is a warning."""
-        if not self._end():
-            warnings.warn(f"the driver of {self.config.name} does not respond. It is closed later.", stacklevel=2)
-
-    def _end(self) -> bool:
-        """Stop the thread, and return whether it has ended in time."""
         atexit.unregister(self.disconnect)
         self._stop.set()
         with self._changed:
             self._changed.notify_all()
-        if self._thread is None:
-            return True
-        self._thread.join(self.config.timeout_s + 1)
-        return not self._thread.is_alive()
+        if self._thread is not None:
+            self._thread.join(self.config.timeout_s + 1)
+            if self._thread.is_alive():
+                warnings.warn(f"the driver of {self.config.name} does not respond. It is closed later.", stacklevel=2)
 
     @property
     def is_connected(self) -> bool:
@@ -157,10 +152,7 @@ class OpenCVCamera:
     def statistics(self) -> CameraStatistics:
         """Counts of frames since `connect`."""
         with self._changed:
-            counts = self._counts
-            return CameraStatistics(
-                counts["frames"], self._pace.dropped, counts["skipped"], counts["damaged"], self._pace.rate
-            )
+            return dataclasses.replace(self._counts, dropped=self._pace.dropped, rate=self._pace.rate)
 
     @property
     def source(self) -> str:
@@ -196,9 +188,9 @@ class OpenCVCamera:
         return self._held.get("exposure")
 
     def read(self, timeout_ms: float | None = None) -> Captured:
-        """See `Camera.read`. The first `in_flight` frames that arrive after the start of the call are discarded."""
+        """See `Camera.read`. The first two frames that arrive after the start of the call are discarded."""
         with self._changed:
-            first = self._next + self.config.in_flight
+            first = self._next + _IN_FLIGHT
             return self._wait(timeout_ms, lambda frame: frame.sequence >= first and not frame.delayed)
 
     def async_read(self, timeout_ms: float | None = None) -> Captured:
@@ -215,8 +207,7 @@ class OpenCVCamera:
         age_ms = 1000 * (time.monotonic() - frame.time_s)
         if age_ms > max_age_ms:
             raise StaleFrameError(
-                f"the newest frame of {self.config.name} is {age_ms:.0f} ms old, but at most {max_age_ms:g} ms are "
-                "allowed: check the camera, or raise max_age_ms."
+                f"the newest frame of {self.config.name} is {age_ms:.0f} ms old, max_age_ms={max_age_ms:g}"
             )
         return frame
 
@@ -233,10 +224,7 @@ class OpenCVCamera:
             if self._stop.is_set() or (self._problem is not None and not (lost_before and self._is_lost())):
                 raise self._error(limit_s)
             if self._epoch != epoch and not lost_before:
-                raise CameraLostError(
-                    f"{self.config.name} was lost during the call and found again (epoch {self._epoch}): repeat the "
-                    "call."
-                )
+                raise CameraLostError(f"{self.config.name} was lost during the call and found again: repeat the call.")
             if remaining <= 0:
                 raise self._error(limit_s)
             self._changed.wait(remaining)
@@ -265,16 +253,13 @@ class OpenCVCamera:
             age = f"the last one arrived {time.monotonic() - self._newest.time_s:.2f} s ago"
         return CameraTimeoutError(
             f"{self.config.name} has sent no usable frame within {1000 * limit_s:.0f} ms ({age}, "
-            f"{self._counts['damaged']} damaged frames since connect): check the device or the stream's server, or "
-            "raise the timeout."
+            f"{self._counts.damaged} damaged frames since connect): check the device, or the stream's server."
         )
 
     def __enter__(self) -> "OpenCVCamera":
         return self.connect() if self._stop.is_set() else self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.disconnect()
 
     # The thread
@@ -337,8 +322,7 @@ class OpenCVCamera:
             if self._stop.is_set():
                 return
             if image is None:
-                with self._changed:
-                    self._counts["damaged"] += 1
+                self._counts.damaged += 1
                 continue
             if image.shape[1::-1] != capture.size:
                 self._set_problem(FrameSizeError, _size_message(config, image.shape[1::-1], capture.size))
@@ -352,12 +336,11 @@ class OpenCVCamera:
             counted = 0 if limit_s is None else repeats
             frame = previous = Captured(image, time_s, sequence, self._epoch, dropped, counted, delayed)
             if counted and not frame.black and limit_s is not None and time_s - same_since > limit_s:
-                self._set_problem(
-                    FrozenCameraError,
-                    f"{config.name} has sent the same image {repeats + 1} times, for {time_s - same_since:.1f} s: "
-                    "replug the camera or restart its server. If the source may repeat images, set "
-                    "frozen_after_s=None in CameraConfig.",
+                message = (
+                    f"{config.name} has sent the same image for {time_s - same_since:.1f} s: replug the camera, or "
                 )
+                message += "restart its server. If it may repeat images, set frozen_after_s=None in CameraConfig."
+                self._set_problem(FrozenCameraError, message)
                 continue
             self._publish(frame)
             if (task := self._task) is not None:
@@ -371,10 +354,10 @@ class OpenCVCamera:
 
     def _publish(self, frame: Captured) -> None:
         with self._changed:
-            self._counts["frames"] += 1
+            self._counts.frames += 1
             while len(self._queue) >= self.config.buffer:
                 self._queue.popleft()
-                self._counts["skipped"] += 1
+                self._counts.skipped += 1
             self._queue.append(frame)
             self._newest, self._problem = frame, None
             self._changed.notify_all()
@@ -385,16 +368,13 @@ class OpenCVCamera:
             self._queue.clear()
             self._changed.notify_all()
 
-    def _lock_settings(self, capture: "Capture") -> None:
+    def _lock_all(self, capture: "Capture") -> None:
         self._held, refused = lock(capture.device, self._held, current=True)
         self._refused = capture.warnings + list(refused.values())
 
 
 def _lost(config: CameraConfig) -> str:
-    return (
-        f"{config.name} was lost. A thread tries to open it again every {FIRST_WAIT_S:g} to {LONGEST_WAIT_S:g} s, "
-        "until it succeeds or disconnect() is called: check its cable or its server."
-    )
+    return f"{config.name} was lost, and a thread tries to open it again: check its cable or its server."
 
 
 class Capture:
@@ -411,41 +391,43 @@ class Capture:
         self.warnings: list[str] = []  # requests that the driver did not accept
         self._jpeg = False
         try:
-            self._set_up()
+            if not self.device.isOpened():
+                remedy = "check the address, the path and the password, and that its server sends video."
+                if config.kind == "device":
+                    remedy = (
+                        f"it is missing, in use (`fuser {config.path}`), your user is not in the group video, or it is "
+                        f"no camera. Cameras found: {', '.join(map(str, find_cameras())) or 'none'}."
+                    )
+                raise CameraError(f"{config.name} cannot be opened: {remedy}")
+            if config.kind == "device":
+                self._request_format()
+            elif self._fourcc() == _MJPG:
+                self._jpeg = self.device.set(cv2.CAP_PROP_FORMAT, -1)
+            sides = cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT
+            self.size = tuple(round(self.device.get(side)) for side in sides)
+            wanted = config.width or self.size[0], config.height or self.size[1]
+            if self.size != wanted:
+                raise FrameSizeError(_size_message(config, self.size, wanted))
         except BaseException:
             self.device.release()
             raise
 
-    def _set_up(self) -> None:
-        """Request format, size and rate, and check the size."""
+    def _request_format(self) -> None:
+        """Request the format, the size and the frame rate of a device."""
         config, device = self._config, self.device
-        if not device.isOpened():
-            remedy = (
-                f"it is missing, another process uses it (`fuser {config.path}`), your user is not in the group video, "
-                f"or it is no camera. {cameras_found()}"
-            )
-            if config.kind == "stream":
-                remedy = "check the address, the path and the password, and that its server sends video."
-            raise CameraError(f"{config.name} cannot be opened: {remedy}")
-        if config.kind == "device":
-            if config.fourcc is not None:
-                device.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*config.fourcc))
-                fourcc = self._fourcc().to_bytes(4, "little").decode(errors="replace")
-                if fourcc != config.fourcc:
-                    self.warnings.append(f"FOURCC: asked for {config.fourcc}, found {fourcc}")
-            if config.width is not None and config.height is not None:
-                device.set(cv2.CAP_PROP_FRAME_WIDTH, config.width)
-                device.set(cv2.CAP_PROP_FRAME_HEIGHT, config.height)
-            if config.fps is not None:
-                device.set(cv2.CAP_PROP_FPS, config.fps)
-                rate = device.get(cv2.CAP_PROP_FPS)
-                if abs(rate - config.fps) > _RATE_TOLERANCE * config.fps:
-                    self.warnings.append(f"FPS: asked for {config.fps:g}, found {rate:g}")
-        elif self._fourcc() == _MJPG:
-            self._jpeg = device.set(cv2.CAP_PROP_FORMAT, -1)
-        self.size = round(device.get(cv2.CAP_PROP_FRAME_WIDTH)), round(device.get(cv2.CAP_PROP_FRAME_HEIGHT))
-        if config.width is not None and config.height is not None and self.size != (config.width, config.height):
-            raise FrameSizeError(_size_message(config, self.size, (config.width, config.height)))
+        if config.fourcc is not None:
+            device.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*config.fourcc))
+            fourcc = self._fourcc().to_bytes(4, "little").decode(errors="replace")
+            if fourcc != config.fourcc:
+                self.warnings.append(f"FOURCC: asked for {config.fourcc}, found {fourcc}")
+        if config.width is not None and config.height is not None:
+            device.set(cv2.CAP_PROP_FRAME_WIDTH, config.width)
+            device.set(cv2.CAP_PROP_FRAME_HEIGHT, config.height)
+        if config.fps is not None:
+            device.set(cv2.CAP_PROP_FPS, config.fps)
+            rate = device.get(cv2.CAP_PROP_FPS)
+            if abs(rate - config.fps) > _RATE_TOLERANCE * config.fps:
+                self.warnings.append(f"FPS: asked for {config.fps:g}, found {rate:g}")
 
     def _fourcc(self) -> int:
         return int(self.device.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF
@@ -490,25 +472,20 @@ def _open(config: CameraConfig) -> cv2.VideoCapture:
             # OpenCV reads this variable at its first frame. Without it, a stalled device blocks for 10 s.
             os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", str(math.ceil(config.timeout_s)))
             return cv2.VideoCapture(config.path, cv2.CAP_V4L2)
-        return cv2.VideoCapture(config.target, cv2.CAP_ANY)
+        number = str(config.source)
+        return cv2.VideoCapture(int(number) if number.isdecimal() else number, cv2.CAP_ANY)
     milliseconds = round(1000 * config.timeout_s)
     parameters = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, milliseconds, cv2.CAP_PROP_READ_TIMEOUT_MSEC, milliseconds]
     parameters += [cv2.CAP_PROP_N_THREADS, 1]  # a decoder with n threads delays the images by n frames
     return cv2.VideoCapture(config.path, cv2.CAP_FFMPEG, parameters)
 
 
-def _size_message(config: CameraConfig, size: tuple[int, ...], wanted: tuple[int, int]) -> str:
+def _size_message(config: CameraConfig, size: tuple[int, ...], wanted: tuple[int, ...]) -> str:
     return (
         f"{config.name} sends frames of {size[0]} x {size[1]} pixels, but {wanted[0]} x {wanted[1]} were asked for: "
         f"give CameraConfig a size that it sends (`v4l2-ctl -d {config.path} --list-formats-ext` lists those of a "
-        "device, and some need fourcc='MJPG'), or change it at the stream's server."
+        "device, and some need fourcc='MJPG')."
     )
-
-
-def requested(config: CameraConfig) -> dict[str, float]:
-    """The values that a configuration requests for exposure, gain, white balance and focus."""
-    values = {field: getattr(config, field) for field, *_ in _SETTINGS}
-    return {field: value for field, value in values.items() if value is not None}
 
 
 def lock(device: Any, values: Mapping[str, float], *, current: bool = False) -> tuple[dict[str, float], dict[str, str]]:
@@ -516,19 +493,22 @@ def lock(device: Any, values: Mapping[str, float], *, current: bool = False) -> 
 
     Args:
         device: Open `cv2.VideoCapture`.
-        values: Values to set, by field name of `CameraConfig` (`exposure`, `gain`, `white_balance`, `focus`).
-        current: If True, exposure, white balance and focus are locked at their current values if `values` lacks them.
+        values: Values to set, by field name of `CameraConfig` (`exposure`, `white_balance`, `focus`).
+        current: If True, settings that `values` lacks are locked at their current values if the device has them.
 
     Returns:
         The values that the device has now, by field name, and texts on the properties that the driver did not set, by
-        OpenCV's name. Without a value, automatic focus and the values themselves may be unsupported.
+        OpenCV's name.
     """
     held: dict[str, float] = {}
     refused: dict[str, str] = {}
 
+    def prop(name: str) -> int:
+        return int(getattr(cv2, f"CAP_PROP_{name}"))
+
     def try_to_set(name: str, value: float, needed: bool) -> None:
-        device.set(_property(name), value)
-        actual = device.get(_property(name))
+        device.set(prop(name), value)
+        actual = device.get(prop(name))
         if actual == _UNSUPPORTED:
             if needed:
                 refused[name] = f"{name}: asked for {value:g}, the driver lacks it"
@@ -539,19 +519,15 @@ def lock(device: Any, values: Mapping[str, float], *, current: bool = False) -> 
         value = values.get(field)
         if value is None and not current:
             continue
-        before = device.get(_property(name))
+        before = device.get(prop(name))
         try_to_set(automatic, off, needed=value is not None or field != "focus")
         if value is None and before == _UNSUPPORTED:
             continue
         try_to_set(name, before if value is None else value, needed=True)
-        actual = device.get(_property(name))
+        actual = device.get(prop(name))
         if actual != _UNSUPPORTED:
             held[field] = actual
     return held, refused
-
-
-def _property(name: str) -> int:
-    return int(getattr(cv2, f"CAP_PROP_{name}"))
 
 
 def _identical(a: Image, b: Image) -> bool:

@@ -41,8 +41,7 @@ class LightError(RuntimeError):
 class Shot:
     """An image of one stream.
 
-    The lights did not change from `before.acknowledged_s` to `until_s`. The frame arrived in between, at least one
-    settling time after `before.acknowledged_s`.
+    The lights did not change from `before.acknowledged_s` to `until_s`. The frame arrived in between.
     """
 
     image: UInt8[np.ndarray, "height width 3"]  # RGB, raw and uncropped, read-only
@@ -83,6 +82,11 @@ class Switch:
     thumbnails: Float[np.ndarray, "n 24 32 3"]  # thumbnail of each frame, 0 to 255
 
 
+def other(stream: Stream) -> Stream:
+    """The stream that is not this one."""
+    return "tactile" if stream == "visual" else "visual"
+
+
 def thumbnail(image: UInt8[np.ndarray, "height width 3"]) -> Thumbnail:
     """Mean colours of 24 rows and 32 columns of blocks of an RGB image, 0 to 255."""
     return cv2.resize(image, _SIZE, interpolation=cv2.INTER_AREA).astype(np.float32)
@@ -99,10 +103,7 @@ def check_contrast(dark: Thumbnail, lit: Thumbnail) -> None:
 
 
 def light_share(look: Thumbnail, dark: Thumbnail, lit: Thumbnail) -> float:
-    """Brightness of the lights: the number `s` for which `dark + s (lit - dark)` is closest to `look`.
-
-    Parts of the view that the lights do not reach have no influence.
-    """
+    """Brightness of the lights: the number `s` for which `dark + s (lit - dark)` is closest to `look`."""
     change = lit - dark
     return float(((look - dark) * change).sum() / (change**2).sum())
 
@@ -110,13 +111,9 @@ def light_share(look: Thumbnail, dark: Thumbnail, lit: Thumbnail) -> float:
 def switched_share(look: Thumbnail, before: Thumbnail, change: Thumbnail) -> float:
     """How far the lights had been switched when an image was taken: 0 means not yet, 1 means fully.
 
-    The result is the median of `(look - before) / change` over the values that the switch changes clearly. Because of
-    the median, an object that moves in less than half of the view has no influence.
-
-    Args:
-        look: Thumbnail of the image.
-        before: Thumbnail of an image before the switch.
-        change: Effect of a complete switch on a thumbnail, from two earlier images.
+    The result is the median of `(look - before) / change` over the values that the switch changes clearly, where
+    `change` is the effect of a complete switch. Because of the median, an object that moves in less than half of the
+    view has no influence.
     """
     effect = np.abs(change)
     visible = effect >= _VISIBLE
@@ -131,11 +128,6 @@ def settling(on: Sequence[Switch], off: Sequence[Switch], period_s: float) -> Se
 
     A settling time is the largest delay of a frame that is not settled, plus the period of the camera, because a switch
     can occur at any time within an exposure, and the measured switches occurred at only a few such times.
-
-    Args:
-        on: Switches from off to on.
-        off: Switches from on to off.
-        period_s: Time between two frames (s).
     """
     dark = np.mean([switch.thumbnails[-1] for switch in off], axis=0)
     lit = np.mean([switch.thumbnails[-1] for switch in on], axis=0)
@@ -152,62 +144,41 @@ def last_mixed(switch: Switch, dark: Thumbnail, lit: Thumbnail) -> float:
 
 
 @runtime_checkable
-class FrameSource(Protocol):
-    """The part of a `Camera` that the proof of light needs."""
-
+class _Frames(Protocol):  # the part of a `Camera` that is needed here
     @property
-    def source(self) -> str:
-        """Name of the camera."""
-
-    def async_read(self, timeout_ms: float | None = None) -> Captured:
-        """Return the oldest frame that was not returned yet, or wait for the next one."""
+    def source(self) -> str: ...
+    def async_read(self, timeout_ms: float | None = None) -> Captured: ...
 
 
 @runtime_checkable
-class Lights(Protocol):
-    """The part of `Leds` that the proof of light needs."""
-
-    def set(self, levels: protocol.Levels) -> Lit:
-        """Set the levels."""
-
-    def ping(self) -> Lit:
-        """Ask for the levels."""
-
-    def reconnect(self, *, limit_s: float) -> object:
-        """Search a lost controller for at most a time (s)."""
+class _Lights(Protocol):  # the part of `Leds` that is needed here
+    def set(self, levels: protocol.Levels) -> Lit: ...
+    def ping(self) -> Lit: ...
+    def reconnect(self, *, limit_s: float) -> object: ...
 
 
 @runtime_checkable
-class Clock(Protocol):
-    """The functions of the module `time` that the proof of light needs. A twin has a virtual clock."""
-
-    def monotonic(self) -> float:
-        """The current time (s)."""
-
-    def sleep(self, seconds: float, /) -> None:
-        """Wait (s)."""
+class _Clock(Protocol):  # the module `time`, or the virtual clock of a twin
+    def monotonic(self) -> float: ...
+    def sleep(self, seconds: float, /) -> None: ...
 
 
 class ProvenFrames:
     """Switches the lights of a connected sensor, and takes frames that are proven to show the new state of the lights.
 
-    - After each switch of the lights, frames are discarded until two successive frames show the new state, compared
-      with a frame from before the switch.
-    - After each taken frame, the controller must confirm that the lights have not changed since the switch.
-
-    Only one thread may take images.
+    `STS` states the conditions. Only one thread may take images.
     """
 
     def __init__(
         self,
-        camera: FrameSource,
-        leds: Lights,
+        camera: _Frames,
+        leds: _Lights,
         *,
         levels: protocol.Levels,
         exposures: tuple[float, float] | None,
         timeout_s: float,
         reconnect_s: float,
-        clock: Clock = time,
+        clock: _Clock = time,
     ):
         """Use open devices, see `STS`. Call `measure_settling` or `see_both` before the first image is taken."""
         self._camera, self._leds, self._clock = camera, leds, clock
@@ -233,8 +204,7 @@ class ProvenFrames:
                 return measured
         raise LightError(
             f"the image was still changing {watch_s:.2f} s after the lights were switched, in {_ATTEMPTS} attempts: "
-            "keep the scene at rest and lock the camera's exposure. If the lights are slow, pass their settling times "
-            "as STS(settling=Settling(visual_s, tactile_s))."
+            "keep the scene at rest and lock the camera's exposure. For slow lights, pass STS(settling=...)."
         )
 
     def _measured(self, switches: int, watch_s: float) -> Settling | None:
@@ -274,14 +244,12 @@ class ProvenFrames:
     def pair(self, deadline: float) -> Pair:
         """Take an image of each stream. Both frames arrive after the start of this call.
 
-        The lights are switched only once for a pair, unless a connection is lost.
-
         Args:
-            deadline: Time on the clock `time.monotonic` at which the wait for frames ends (s). The time of a
-                reconnection to the controller extends it.
+            deadline: Time on the clock at which the wait for frames ends (s). A reconnection to the controller extends
+                it.
         """
         first = self.stream
-        second: Stream = "tactile" if first == "visual" else "visual"
+        second = other(first)
         while True:
             lost_s = self._lost_s
             one = self.shot(first, deadline, after_s=self._clock.monotonic(), then=second)
@@ -298,14 +266,14 @@ class ProvenFrames:
             stream: Stream of the image.
             deadline: See `pair`.
             after_s: Earliest arrival time of the frame on the same clock (s).
-            then: Stream for which the lights are set after the frame. None: the lights do not change.
+            then: Stream for which the lights are set after the frame.
         """
         while True:
             try:
                 if self._doubtful:
                     # Late frames may show two switches of the lights. After a frame that shows the lights of the other
                     # stream, all later frames can show only one switch.
-                    self._frame("visual" if stream == "tactile" else "tactile", deadline, 0.0)
+                    self._frame(other(stream), deadline, 0.0)
                     self._doubtful = False
                 before, frame = self._frame(stream, deadline, after_s)
                 until_s = self._proof(before, then)
@@ -331,7 +299,9 @@ class ProvenFrames:
 
     def _frame(self, stream: Stream, deadline: float, after_s: float) -> tuple[Lit, Captured]:
         """Return a frame that arrives after the lights have settled, and the controller's answer to their switch."""
-        lit, checked_s = self._switched(stream), 0.0
+        lit, checked_s = self._lit, 0.0
+        if lit is None or self.stream != stream:
+            lit = self._set(stream)
         assert self._settling is not None, "call measure_settling or see_both first"
         settled_s = self._settling.visual_s if stream == "visual" else self._settling.tactile_s
         while (left_s := deadline - self._clock.monotonic()) > 0:
@@ -343,7 +313,9 @@ class ProvenFrames:
                 continue
             spoilt = frame.repeats > 0 or (frame.black and self._black.get(stream) is False)
             if self._departed < 2 and not spoilt:
-                self._departed = (self._departed * self._in_order(frame) + 1) * self._shows(frame, stream)
+                last = self._previous
+                in_order = last is not None and (frame.epoch, frame.sequence) == (last.epoch, last.sequence + 1)
+                self._departed = (self._departed * in_order + 1) * self._shows(frame, stream)
             self._previous = frame
             late_s = frame.time_s - max(lit.acknowledged_s + settled_s, after_s)
             if self._departed >= 2 and late_s >= 0 and not spoilt and not frame.delayed:
@@ -354,7 +326,7 @@ class ProvenFrames:
                     lit = self._set(stream)
                 elif frame.time_s > lit.acknowledged_s + settled_s + _AGAIN_S:
                     # The scene may have changed at the switch. The repeated switch is compared with a newer frame.
-                    self._watched("tactile" if stream == "visual" else "visual", settled_s)
+                    self._watched(other(stream), settled_s)
                     lit = self._set(stream)
                 checked_s = self._clock.monotonic()
         remedy = "check that the LEDs light up, that the camera's exposure is locked, and that enough frames arrive"
@@ -366,29 +338,14 @@ class ProvenFrames:
         )
 
     def _shows(self, frame: Captured, stream: Stream) -> bool:
-        """Return whether a frame shows the last switch: the median value changes by more than half of the effect.
-
-        The frame is compared with the last frame before the switch. If the lights before the switch are unknown, the
-        frame is compared with the last image of the other stream.
-        """
+        """Return whether a frame shows the last switch: the median value changes by more than half of the effect."""
         if self._effect is None:
             return True
-        before = self._looks["tactile" if stream == "visual" else "visual"]
-        if self._reference is not None:
-            before = self._reference
+        before = self._reference  # the last frame before the switch, if the lights before the switch are known
+        if before is None:
+            before = self._looks[other(stream)]
         change = self._effect if stream == "tactile" else -self._effect
         return switched_share(thumbnail(frame.image), before, change) > _DEPARTED
-
-    def _in_order(self, frame: Captured) -> bool:
-        """Return whether a frame directly follows the previous one."""
-        last = self._previous
-        return last is not None and (frame.epoch, frame.sequence) == (last.epoch, last.sequence + 1)
-
-    def _switched(self, stream: Stream) -> Lit:
-        """Set the lights of a stream unless they are set already, and return the controller's answer to the switch."""
-        if self._lit is None or self.stream != stream:
-            return self._set(stream)
-        return self._lit
 
     def _set(self, stream: Stream) -> Lit:
         before = self._previous if self._lit is not None and self.stream != stream else None

@@ -1,4 +1,4 @@
-"""The serial protocol of the LED controller: messages as dataclasses, and their encoding as lines of text.
+"""The serial protocol of the LED controller: messages as named tuples, and their encoding as lines of text.
 
 A line consists of ASCII text, `*`, the checksum of the text in four hexadecimal digits, and a newline, such as
 `7 PING*018E`. The host sends requests, and the controller answers each with one reply of the same sequence number.
@@ -6,9 +6,11 @@ docs/hardware/protocol.md defines them. Each message has exactly one valid line.
 """
 
 import binascii
-import dataclasses
+import contextlib
 import enum
 import re
+from collections.abc import Iterable
+from typing import Any, NamedTuple
 
 VERSION = 1  # version of the protocol
 BAUD = 115200  # 8 data bits, no parity, 1 stop bit
@@ -18,7 +20,6 @@ LAST_SEQUENCE = 65535  # largest sequence number. 1 follows it. 0 marks replies 
 SHORTEST_WATCH_MS = 100  # shortest period of the watchdog (ms)
 LONGEST_WATCH_MS = 10_000  # longest period of the watchdog (ms)
 DEFAULT_WATCH_MS = 1000  # period of the watchdog after a boot (ms)
-_UINT16, _UINT32 = 2**16 - 1, 2**32 - 1
 
 Levels = tuple[int, int, int, int]  # duty cycles of the channels, 0 (off) to 255 (always on)
 DARK: Levels = (0, 0, 0, 0)
@@ -39,55 +40,48 @@ class ProtocolError(ValueError):
 
     def __init__(self, message: str, code: Code = Code.CHECKSUM, sequence: int = 0):
         super().__init__(message)
-        self.code = code
-        self.sequence = sequence
+        self.code, self.sequence = code, sequence
 
 
-@dataclasses.dataclass(frozen=True)
-class Hello:
+class Hello(NamedTuple):
     """Request for the description of the controller (`Controller`)."""
 
     sequence: int
     version: int = VERSION  # version of the protocol that the host uses
 
 
-@dataclasses.dataclass(frozen=True)
-class Set:
+class Set(NamedTuple):
     """Request to set the levels of the lights (`State`)."""
 
     sequence: int
     levels: Levels
 
 
-@dataclasses.dataclass(frozen=True)
-class Ping:
+class Ping(NamedTuple):
     """Request for the state of the lights (`State`). Like any request, it restarts the watchdog."""
 
     sequence: int
 
 
-@dataclasses.dataclass(frozen=True)
-class Watch:
-    """Request to set the watchdog's period (`Watching`)."""
+class Watch(NamedTuple):
+    """Request to set the watchdog's period. The reply is the same."""
 
     sequence: int
     period_ms: int  # the lights go off after this time without a request, 100 to 10000 (ms)
 
 
-@dataclasses.dataclass(frozen=True)
-class Controller:
+class Controller(NamedTuple):
     """The reply to a `Hello` request."""
 
     sequence: int
-    version: int  # version of the protocol that the controller uses
-    firmware: str  # version of the firmware
-    board: str  # name of the board
-    serial_number: str  # serial number of the controller
-    channels: int  # number of channels
+    version: int  # version of the protocol that the controller uses. If it is another one, the rest is unknown
+    firmware: str = "unknown"  # version of the firmware
+    board: str = "unknown"  # name of the board
+    serial_number: str = "unknown"  # serial number of the controller
+    channels: int = 0  # number of channels
 
 
-@dataclasses.dataclass(frozen=True)
-class State:
+class State(NamedTuple):
     """The reply to a `Set` or `Ping` request."""
 
     sequence: int
@@ -97,16 +91,7 @@ class State:
     uptime_ms: int | None = None  # time since the boot (ms). None in replies to `Set`
 
 
-@dataclasses.dataclass(frozen=True)
-class Watching:
-    """The reply to a `Watch` request."""
-
-    sequence: int
-    period_ms: int
-
-
-@dataclasses.dataclass(frozen=True)
-class Refused:
+class Refused(NamedTuple):
     """The reply to a request that the controller did not execute."""
 
     sequence: int  # 0 if the controller could not read the request's sequence number
@@ -114,15 +99,39 @@ class Refused:
     text: str  # the reason in words
 
 
-@dataclasses.dataclass(frozen=True)
-class TurnedOff:
+class TurnedOff(NamedTuple):
     """Line that the controller sends without a request: the watchdog has turned the lights off."""
 
+    sequence: int  # always 0
     counter: int  # number of changes of the levels since the boot, this one included
 
 
 Request = Hello | Set | Ping | Watch
-Reply = Controller | State | Watching | Refused | TurnedOff
+Reply = Controller | State | Watch | Refused | TurnedOff
+
+_UINT16, _UINT32 = range(2**16), range(2**32)
+_VERSION, _CHANNELS = range(VERSION, VERSION + 1), range(CHANNELS, CHANNELS + 1)
+_LEVELS = (range(256),) * CHANNELS
+_PERIOD = range(SHORTEST_WATCH_MS, LONGEST_WATCH_MS + 1)
+_NUMBERED = range(1, LAST_SEQUENCE + 1)
+_NAME = re.compile(r"[A-Za-z0-9._-]+")
+_TEXT = re.compile(r".*[^ ].*")  # may contain spaces, and is the last value of a line
+
+# Class, words after the sequence number, sequence number and values of each message. A range contains the valid numbers
+_REQUESTS: tuple[tuple[type, str, tuple], ...] = (
+    (Hello, "HELLO", (_NUMBERED, _UINT16)),
+    (Set, "SET", (_NUMBERED, _LEVELS)),
+    (Ping, "PING", (_NUMBERED,)),
+    (Watch, "WATCH", (_NUMBERED, _PERIOD)),
+)
+_REPLIES: tuple[tuple[type, str, tuple], ...] = (
+    (Controller, "OK HELLO", (_NUMBERED, _VERSION, _NAME, _NAME, _NAME, _CHANNELS)),
+    (State, "OK SET", (_NUMBERED, _LEVELS, _UINT32, _UINT16)),
+    (State, "OK PING", (_NUMBERED, _LEVELS, _UINT32, _UINT16, _UINT32)),
+    (Watch, "OK WATCH", (_NUMBERED, _PERIOD)),
+    (Refused, "ERR", (range(LAST_SEQUENCE + 1), Code, _TEXT)),
+    (TurnedOff, "OFF watchdog", (range(1), range(1, 2**32))),
+)
 
 
 def checksum(text: bytes) -> int:
@@ -155,128 +164,83 @@ def decode(line: bytes) -> str:
 
 def encode_request(request: Request) -> bytes:
     """Encode a request as a line with its checksum and newline."""
-    match request:
-        case Hello(sequence, version):
-            text = f"{sequence} HELLO {version}"
-        case Set(sequence, levels):
-            text = f"{sequence} SET {_joined(levels)}"
-        case Ping(sequence):
-            text = f"{sequence} PING"
-        case Watch(sequence, period_ms):
-            text = f"{sequence} WATCH {period_ms}"
-    line = encode(text)
+    line = encode(_written(request, _REQUESTS))
     decode_request(line)  # checks the ranges
     return line
 
 
 def decode_request(line: bytes) -> Request:
     """Decode a request from a line with its checksum and newline."""
-    words = decode(line).split(" ")
-    sequence = _number(words[0], 1, LAST_SEQUENCE)
-    if sequence is None:
-        raise ProtocolError(f"the sequence number of {line!r} must be in 1..{LAST_SEQUENCE}", Code.ARGUMENTS)
-    match words[1:]:
-        case ["HELLO", version] if (number := _number(version, 0, _UINT16)) is not None:
-            return Hello(sequence, number)
-        case ["SET", *values] if (levels := _levels(values)) is not None:
-            return Set(sequence, levels)
-        case ["PING"]:
-            return Ping(sequence)
-        case ["WATCH", period] if (number := _number(period, SHORTEST_WATCH_MS, LONGEST_WATCH_MS)) is not None:
-            return Watch(sequence, number)
-        case ["HELLO" | "SET" | "PING" | "WATCH", *_]:
-            raise ProtocolError(f"wrong number or range of arguments in {line!r}", Code.ARGUMENTS, sequence)
-    raise ProtocolError(f"unknown command in {line!r}", Code.COMMAND, sequence)
+    text = decode(line)
+    request = _read(text, _REQUESTS)
+    if request is not None:
+        return request
+    sequence, *words = text.split(" ")
+    try:
+        number = _value(_NUMBERED, [sequence])
+    except ValueError as error:
+        raise ProtocolError(f"the sequence number of {line!r} must be in 1..65535", Code.ARGUMENTS) from error
+    if words[:1] in [[name] for _, name, _ in _REQUESTS]:
+        raise ProtocolError(f"wrong number or range of arguments in {line!r}", Code.ARGUMENTS, number)
+    raise ProtocolError(f"unknown command in {line!r}", Code.COMMAND, number)
 
 
 def encode_reply(reply: Reply) -> bytes:
     """Encode a reply as a line with its checksum and newline."""
-    match reply:
-        case Controller(sequence, version, firmware, board, serial_number, channels):
-            text = f"{sequence} OK HELLO {version} {firmware} {board} {serial_number} {channels}"
-        case State(sequence, levels, counter, boot, None):
-            text = f"{sequence} OK SET {_joined(levels)} {counter} {boot}"
-        case State(sequence, levels, counter, boot, uptime_ms):
-            text = f"{sequence} OK PING {_joined(levels)} {counter} {boot} {uptime_ms}"
-        case Watching(sequence, period_ms):
-            text = f"{sequence} OK WATCH {period_ms}"
-        case Refused(sequence, code, words):
-            text = f"{sequence} ERR {int(code)} {words}"
-        case TurnedOff(counter):
-            text = f"0 OFF watchdog {counter}"
-    line = encode(text)
+    line = encode(_written(reply, _REPLIES))
     decode_reply(line)  # checks the ranges
     return line
 
 
 def decode_reply(line: bytes) -> Reply:
     """Decode a reply from a line with its checksum and newline."""
-    reply = _reply(decode(line).split(" "))
+    text = decode(line)
+    reply = _read(text, _REPLIES)
+    if reply is None and (other := re.fullmatch(r"([1-9][0-9]*) OK HELLO (0|[1-9][0-9]*)( .*)?", text)):
+        # In all versions of the protocol, the first value of this reply is the version.
+        sequence, version = int(other[1]), int(other[2])
+        if sequence in _NUMBERED and version in _UINT16 and version != VERSION:
+            return Controller(sequence, version)
     if reply is None:
         raise ProtocolError(f"the line {line!r} is not a reply of the LED controller's protocol", Code.ARGUMENTS)
     return reply
 
 
-def _reply(words: list[str]) -> Reply | None:
-    """The reply that consists of these words, or None if they are not a valid reply."""
-    sequence = _number(words[0], 0, LAST_SEQUENCE)
-    match words[1:]:
-        case ["OFF", "watchdog", counter] if sequence == 0 and (changes := _number(counter, 1, _UINT32)) is not None:
-            return TurnedOff(changes)
-        case ["ERR", code, *text] if sequence is not None and (number := _number(code, 1, len(Code))) and any(text):
-            return Refused(sequence, Code(number), " ".join(text))
-    if not sequence:
-        return None
-    match words[1:]:
-        case ["OK", "HELLO", *values]:
-            return _controller(sequence, values)
-        case ["OK", "SET", *values] if len(values) == CHANNELS + 2:
-            return _state(sequence, values, timed=False)
-        case ["OK", "PING", *values] if len(values) == CHANNELS + 3:
-            return _state(sequence, values, timed=True)
-        case ["OK", "WATCH", period] if (number := _number(period, SHORTEST_WATCH_MS, LONGEST_WATCH_MS)) is not None:
-            return Watching(sequence, number)
+def _written(message: Request | Reply, table: tuple) -> str:
+    """The text of a message: that of the row with its class and its number of values."""
+    values = [value for value in message if value is not None]
+    name = next(name for kind, name, ranges in table if isinstance(message, kind) and len(ranges) == len(values))
+    return " ".join([str(values[0]), name, *_words(values[1:])])
+
+
+def _words(values: Iterable[Any]) -> list[str]:
+    return [word for value in values for word in (_words(value) if isinstance(value, tuple) else [f"{value}"])]
+
+
+def _read(text: str, table: tuple) -> Any:
+    """The message that has a text, or None."""
+    for kind, name, ranges in table:
+        sequence, *words = text.split(" ")
+        names, words = words[: name.count(" ") + 1], [sequence, *words[name.count(" ") + 1 :]]
+        with contextlib.suppress(ValueError, IndexError):
+            values = [_value(valid, words) for valid in ranges]
+            if names == name.split(" ") and not words:
+                return kind(*values)
     return None
 
 
-def _controller(sequence: int, values: list[str]) -> Controller | None:
-    """Decode the reply to HELLO. In all versions of the protocol, its first value is the version."""
-    version = _number(values[0], 0, _UINT16) if values else None
-    if version is None:
-        return None
-    if version != VERSION:
-        return Controller(sequence, version, "unknown", "unknown", "unknown", 0)
-    match values[1:]:
-        case [firmware, board, serial_number, count] if _number(count, CHANNELS, CHANNELS) is not None:
-            if all(re.fullmatch(r"[A-Za-z0-9._-]+", name) for name in (firmware, board, serial_number)):
-                return Controller(sequence, version, firmware, board, serial_number, CHANNELS)
-    return None
-
-
-def _state(sequence: int, values: list[str], *, timed: bool) -> State | None:
-    levels = _levels(values[:CHANNELS])
-    counter, boot = _number(values[CHANNELS], 0, _UINT32), _number(values[CHANNELS + 1], 0, _UINT16)
-    uptime_ms = _number(values[CHANNELS + 2], 0, _UINT32) if timed else None
-    if levels is None or counter is None or boot is None or (timed and uptime_ms is None):
-        return None
-    return State(sequence, levels, counter, boot, uptime_ms)
-
-
-def _levels(words: list[str]) -> Levels | None:
-    if len(words) != CHANNELS:
-        return None
-    first, second, third, fourth = (_number(word, 0, 255) for word in words)
-    if first is None or second is None or third is None or fourth is None:
-        return None
-    return first, second, third, fourth
-
-
-def _number(word: str, smallest: int, largest: int) -> int | None:
-    """A decimal number without sign and leading zeros, or None if the word is not one or is out of range."""
-    if not re.fullmatch(r"0|[1-9][0-9]{0,9}", word):
-        return None
-    return int(word) if smallest <= int(word) <= largest else None
-
-
-def _joined(levels: Levels) -> str:
-    return " ".join(str(level) for level in levels)
+def _value(valid: Any, words: list[str]) -> Any:
+    """Take the words of one value, and return the value. Any word that is not valid raises a `ValueError`."""
+    if isinstance(valid, tuple):
+        return tuple(_value(each, words) for each in valid)
+    if valid is _TEXT:
+        words[:] = [" ".join(words)]
+    word = words.pop(0)
+    if isinstance(valid, re.Pattern):
+        if not valid.fullmatch(word):
+            raise ValueError(word)
+        return word
+    # a number without sign and leading zeros
+    if not re.fullmatch(r"0|[1-9][0-9]{0,9}", word) or (isinstance(valid, range) and int(word) not in valid):
+        raise ValueError(word)
+    return int(word) if isinstance(valid, range) else valid(int(word))

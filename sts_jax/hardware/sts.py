@@ -1,11 +1,12 @@
 """`STS`: camera and lights as one sensor. The lights do not change during the exposure of a returned image."""
 
 import dataclasses
+import functools
+import itertools
 import os
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import NamedTuple
 
 import numpy as np
@@ -52,8 +53,6 @@ class STS:
     All other frames are discarded. Only one thread may use a sensor at a time.
 
     Attributes:
-        camera: The `Camera` that takes the images.
-        levels: Duty cycles of the four LED channels in the tactile stream, 0 (off) to 255 (always on).
         device: The content of the sensor file. None if the sensor was not made by `from_file`.
     """
 
@@ -96,10 +95,12 @@ class STS:
         self._port = leds.port if isinstance(leds, Leds) else leds
         self._leds: Leds | None = leds if isinstance(leds, Leds) else None
         self._settling = settling
-        self._exposures = exposures
         self.device: Device | None = None
-        self._timeout_s, self._reconnect_s = timeout_s, reconnect_s
+        self._timeout_s = timeout_s
         self._frames: ProvenFrames | None = None  # None before the first `connect`
+        self._prove = functools.partial(
+            ProvenFrames, levels=self.levels, exposures=exposures, timeout_s=timeout_s, reconnect_s=reconnect_s
+        )
 
     @classmethod
     def from_file(
@@ -116,11 +117,15 @@ class STS:
         Args:
             path: Path of the sensor file or of the folder that contains it.
             camera: Another source for the same camera, such as its URL with a password, or a whole configuration.
-                None: the configuration of the file.
             leds: Name of the controller's port, needed for a port that is not a USB device. None: `connect` searches
                 all USB ports for the controller's serial number.
-            timeout_s: Longest wait for one image (s), not counting the time of a reconnection.
-            reconnect_s: Longest search for a controller that was lost (s).
+            timeout_s: See `STS`.
+            reconnect_s: See `STS`.
+
+        Raises:
+            SensorFileError: The file is damaged, or has no description of a camera and lights.
+            WrongDeviceError: The camera is not the camera that the file names. `connect` raises the same error for the
+                LED controller.
         """
         device = Device.load(path)
         config = camera if isinstance(camera, CameraConfig) else device.camera_config(camera)
@@ -161,31 +166,17 @@ class STS:
 
         Args:
             warmup_s: Time for the camera's automatic exposure and white balance to settle before they are locked (s).
-
-        Raises:
-            LedError: The controller cannot be opened, or does not answer.
-            CameraError: The camera cannot be opened, sends no frames, or does not accept the `exposures`.
-            LightError: The lights do not change the image, or it keeps changing.
-            ValueError: The LED controller is not the controller that the sensor file names.
         """
-        if self._leds is None:
-            if self.device is not None and not self._port:
-                self._leds = Leds.find(self.device.leds)
-            else:
-                self._leds = Leds.connect(self._port)
+        if self._leds is None and self.device is not None and not self._port:
+            self._leds = Leds.find(self.device.leds)
+        elif self._leds is None:
+            self._leds = Leds.connect(self._port)
         try:
             if self.device is not None:
                 self.device.check_identity(leds=self._leds.serial_number)
             if not self.camera.is_connected:
                 self.camera.connect(warmup_s)
-            self._frames = ProvenFrames(
-                self.camera,
-                self._leds,
-                levels=self.levels,
-                exposures=self._exposures,
-                timeout_s=self._timeout_s,
-                reconnect_s=self._reconnect_s,
-            )
+            self._frames = self._prove(self.camera, self._leds)
             if self._settling is None:
                 self.measure_settling()
             else:
@@ -209,8 +200,8 @@ class STS:
         to the stream for which the lights are already set, so the lights are switched only once for a pair.
 
         Args:
-            timeout_ms: Longest wait for the pair (ms), not counting the time of a reconnection. The last request to the
-                controller may exceed it. None: two times the sensor's `timeout_s`.
+            timeout_ms: Longest wait for the pair (ms), not counting the time of a reconnection. None: two times the
+                sensor's `timeout_s`.
 
         Raises:
             LightError: No frame of one of the streams met the conditions of `STS` in time.
@@ -233,15 +224,16 @@ class STS:
             raise ValueError(f"duty, the share of tactile images, must be in [0, 1], got {duty}")
         if dwell < 1:
             raise ValueError(f"dwell must be >= 1, got {dwell}")
-        return self._images(duty, dwell)
 
-    def _images(self, duty: float, dwell: int) -> Iterator[Shot]:
-        number = tactile = 0
-        while True:
-            stream: Stream = "tactile" if tactile + 0.5 < duty * (number + 1) + 1e-9 else "visual"
-            number, tactile = number + 1, tactile + (stream == "tactile")
-            for _ in range(dwell):
-                yield self._connected.shot(stream, time.monotonic() + self._timeout_s)
+        def images() -> Iterator[Shot]:
+            tactile = 0
+            for number in itertools.count(1):
+                stream: Stream = "tactile" if tactile + 0.5 < duty * number + 1e-9 else "visual"
+                tactile += stream == "tactile"
+                for _ in range(dwell):
+                    yield self._connected.shot(stream, time.monotonic() + self._timeout_s)
+
+        return images()
 
     def wait_until_still(self, timeout_s: float = 10.0, *, window_s: float = 0.5) -> Shot:
         """Wait until the visual stream has been still for `window_s`, and return the last image of this period.
@@ -266,9 +258,8 @@ class STS:
             elif last.time_s - first.time_s >= window_s:
                 return last
         raise TimeoutError(
-            f"within {timeout_s:g} s, there was no period of {window_s:g} s without movement: the last image differs "
-            f"from the first one of its period by {change:.2f} of 255, and {allowed:.2f} are allowed. Keep the scene "
-            "at rest, raise timeout_s, or check whether the light of the room changes."
+            f"within {timeout_s:g} s, there was no period of {window_s:g} s without movement (the last change is "
+            f"{change:.2f} of 255, {allowed:.2f} are allowed): keep the scene at rest, and the light of the room."
         )
 
     def measure_settling(self, switches: int = 8, *, watch_s: float = 1.0) -> Settling:
@@ -276,8 +267,7 @@ class STS:
 
         Args:
             switches: Number of switches of the lights in each direction, off to on and on to off.
-            watch_s: Time for which frames are collected after the first switch in each direction (s). It must be longer
-                than the settling times.
+            watch_s: Time for which frames are collected after the first switch, longer than the settling times (s).
         """
         self._settling = self._connected.measure_settling(switches, watch_s)
         return self._settling
@@ -285,9 +275,7 @@ class STS:
     def __enter__(self) -> "STS":
         return self if self._leds is not None and self.camera.is_connected else self.connect()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.disconnect()
 
     @property
@@ -326,8 +314,7 @@ def choose_exposure(camera: OpenCVCamera, *, longest: float) -> Exposed:
             two frames lowers the frame rate.
 
     Returns:
-        The exposure that is set now. The image may still be too dark, or saturated (brightness of at least 250), if the
-        driver does not change the exposure any further.
+        The exposure that is set now. At the driver's limits, the image may still be too dark or saturated.
     """
     exposure = camera.set_exposure(min(camera.locked.get("exposure") or longest, longest))
     for _ in range(_ATTEMPTS):
