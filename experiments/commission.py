@@ -23,7 +23,7 @@ from sts_jax import hardware
 def find(config: Config) -> str:
     """List the cameras and USB serial ports among which the user must choose, and the command to run next."""
     lines, words = [], ["python", "-m", "experiments.commission"]
-    ports = [port for port in hardware.find_controllers() if port.vendor is not None]
+    ports = [port for port in hardware.find_controllers() if port.vid is not None]
     cameras = {camera.source: str(camera) for camera in hardware.find_cameras()}
     controllers = {p.device: f"{p.device} ({p.description}, serial number {p.serial_number})" for p in ports}
     for option, given, kind, there, remedy in (

@@ -7,6 +7,8 @@ import threading
 import time
 from pathlib import Path
 
+from serial.tools.list_ports_common import ListPortInfo
+
 from sts_jax.hardware import protocol
 
 WAIT_S = 60.0  # longest wait for an event that must come
@@ -18,6 +20,13 @@ def until(condition):
     while not condition():
         assert time.monotonic() < deadline, "the condition did not come true"
         time.sleep(0.005)
+
+
+def usb_port(path, serial_number):
+    """A listed USB port."""
+    port = ListPortInfo(str(path))
+    port.vid, port.pid, port.serial_number, port.description = 0x2341, 0x43, serial_number, "Arduino Uno"
+    return port
 
 
 class Simulated:

@@ -10,7 +10,9 @@ import calibration_images
 import cv2
 import numpy as np
 import pytest
+from led_simulator import usb_port
 from PIL import Image
+from serial.tools import list_ports_common
 
 import sts_jax as sts
 from benchmarks.instruments.peers import DARK, LIT, Lights, Peer, SeenController, SeenLights
@@ -215,7 +217,7 @@ def test_another_controller_on_the_port_is_refused(tmp_path, peer):
 
 def test_the_controller_is_found_by_its_own_serial_number(tmp_path, monkeypatch):
     peers = [Peer(tmp_path / name, serial_number=name) for name in ("AAA", "BBB")]
-    found = [hardware.Port(str(peer.path), "", None, 1, 1) for peer in peers]
+    found = [usb_port(peer.path, None) for peer in peers]
     monkeypatch.setattr(hardware.leds, "find_controllers", lambda: found)
     try:
         with hardware.Leds.find("BBB") as leds:
@@ -410,7 +412,7 @@ def test_each_stream_of_a_device_has_its_exposure(peer, config, monkeypatch, cap
 
 def test_devices_are_listed_with_the_next_command(config, monkeypatch, capsys):
     camera = hardware.FoundCamera("/dev/v4l/by-id/usb-A-index0", "A")
-    ports = [hardware.Port("/dev/ttyACM0", "Uno", "55", 1, 1), hardware.Port("/dev/ttyS0", "n/a", None, None, None)]
+    ports = [usb_port("/dev/ttyACM0", "55"), list_ports_common.ListPortInfo("/dev/ttyS0")]
     monkeypatch.setattr(hardware, "find_cameras", lambda: [camera])
     monkeypatch.setattr(hardware, "find_controllers", lambda: ports)
     commission.main(dataclasses.replace(config, camera=None, leds=None))
@@ -419,7 +421,7 @@ def test_devices_are_listed_with_the_next_command(config, monkeypatch, capsys):
         "cameras:",
         "  /dev/v4l/by-id/usb-A-index0 (A)",
         "USB serial ports:",
-        "  /dev/ttyACM0 (Uno, serial number 55)",
+        "  /dev/ttyACM0 (Arduino Uno, serial number 55)",
     ]
     assert "--camera /dev/v4l/by-id/usb-A-index0 --leds /dev/ttyACM0 --out" in lines[4]
     monkeypatch.setattr(hardware, "find_controllers", lambda: [])

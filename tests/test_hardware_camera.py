@@ -1,6 +1,5 @@
 """The camera against a motion JPEG server with injected faults, and against a fake device of OpenCV."""
 
-import random
 import re
 import threading
 import time
@@ -164,17 +163,12 @@ def test_lost_frames_are_counted_from_the_times(server):
 )
 def test_rate_and_lost_frames_follow_from_the_times(times, rate, dropped):
     pace = Pace(None)
-    for time_s in times:
-        pace.arrived(time_s)
+    estimates = [pace.arrived(time_s) for time_s in times]
     assert pace.rate == pytest.approx(rate, rel=0.1)
-    assert dropped is None or pace.dropped == dropped
     assert not pace.delayed
-
-
-def test_each_gap_is_estimated_when_it_ends():
-    pace = Pace(None)
-    estimates = {n: pace.arrived(0.05 * n) for n in range(60) if n not in (20, 30, 31, 40, 41, 42)}
-    assert {n: lost for n, lost in estimates.items() if lost} == {21: 1, 32: 2, 43: 3}
+    assert dropped is None or pace.dropped == dropped
+    if dropped:
+        assert [lost for lost in estimates if lost] == [1, 2, 3]
 
 
 def test_frames_that_may_have_waited_are_marked():
@@ -315,45 +309,6 @@ def test_a_camera_connects_again_after_disconnect(server):
         for call in (camera.read, camera.async_read, camera.read_latest):
             with pytest.raises(CameraError, match=r"call connect\(\)"):
                 call()
-
-
-@pytest.mark.slow
-def test_random_faults_lead_to_errors_and_back_to_frames(server):
-    rng = random.Random(0)
-    expected = {
-        "stall": (CameraLostError, CameraTimeoutError),
-        "repeat": FrozenCameraError,
-        "small": FrameSizeError,
-        "damaged": CameraTimeoutError,
-        "close": CameraLostError,
-        "refuse": CameraLostError,
-    }
-    epoch, number, sequence = 0, 0, -1
-    with connected(server, timeout_s=1.0, frozen_after_s=0.3) as camera:
-        for _ in range(40):
-            fault = rng.choice(list(expected))
-            if fault == "refuse":
-                server.stop()
-            else:
-                server.mode = fault
-            next_error(camera, expected[fault], timeout_ms=200)
-            server.mode = "live"
-            if fault == "refuse":
-                server.start()
-            frame = next_frame(camera)
-            called = time.monotonic()
-            while True:
-                try:
-                    frame = camera.read()
-                    break
-                except CameraError:
-                    called = time.monotonic()
-            assert server.served[number_of(frame.image)] > called
-            assert number_of(frame.image) > number
-            assert frame.sequence > sequence
-            assert frame.epoch >= epoch
-            epoch, number, sequence = frame.epoch, number_of(frame.image), frame.sequence
-    assert not camera_threads()
 
 
 # Opening

@@ -16,7 +16,7 @@ from unittest import mock
 
 import pytest
 import serial
-from led_simulator import Simulated, until
+from led_simulator import Simulated, until, usb_port
 from serial.tools import list_ports_common
 
 from benchmarks.instruments.peers import Peer
@@ -281,12 +281,6 @@ def test_a_vanished_port_is_named_and_found_again(peer, tmp_path):
     leds.close()
     assert returned.controller.levels == protocol.DARK
     returned.vanish()
-
-
-def usb_port(path, serial_number):
-    port = list_ports_common.ListPortInfo(str(path))
-    port.vid, port.pid, port.serial_number, port.description = 0x2341, 0x43, serial_number, "Arduino Uno"
-    return port
 
 
 def test_a_controller_is_found_under_another_name(tmp_path, monkeypatch):

@@ -37,7 +37,6 @@ from sts_jax.hardware.leds import LedError as LedError
 from sts_jax.hardware.leds import Leds as Leds
 from sts_jax.hardware.leds import LedTimeoutError as LedTimeoutError
 from sts_jax.hardware.leds import Lit as Lit
-from sts_jax.hardware.leds import Port as Port
 from sts_jax.hardware.leds import find_controllers as find_controllers
 from sts_jax.hardware.lens import Lens as Lens
 from sts_jax.hardware.lens import SensorView as SensorView

@@ -241,10 +241,7 @@ def find_cameras(root: Path = Path("/")) -> list[FoundCamera]:
     The `source` of a camera is its path in `/dev/v4l/by-id`, which contains the serial number, else its path in
     `/dev/v4l/by-path`, which contains the USB port, else the path of the device itself.
     """
-    links: dict[Path, Path] = {}
-    for folder in ("by-id", "by-path"):
-        for link in sorted((root / "dev/v4l" / folder).glob("*")):
-            links.setdefault(link.resolve(), link)
+    links = _links("by-path", root) | _links("by-id", root)
     cameras = []
     for device in sorted((root / "dev").glob("video[0-9]*"), key=lambda path: (len(path.name), path.name)):
         properties = root / "sys/class/video4linux" / device.name
@@ -256,10 +253,12 @@ def find_cameras(root: Path = Path("/")) -> list[FoundCamera]:
 
 def stable_path(device: str, root: Path = Path("/")) -> str:
     """Return the path of a device in `/dev/v4l/by-id`, which survives replugging, or `device` if there is none."""
-    for link in sorted((root / "dev/v4l/by-id").glob("*")):
-        if link.resolve() == Path(device).resolve():
-            return str(link)
-    return device
+    return str(_links("by-id", root).get(Path(device).resolve(), device))
+
+
+def _links(folder: str, root: Path) -> dict[Path, Path]:
+    """The first symbolic link of each device in a folder of `/dev/v4l`."""
+    return {link.resolve(): link for link in sorted((root / "dev/v4l" / folder).glob("*"), reverse=True)}
 
 
 def _text(path: Path) -> str:

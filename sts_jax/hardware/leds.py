@@ -15,6 +15,7 @@ from typing import TypeVar
 
 import serial
 from serial.tools import list_ports
+from serial.tools.list_ports_common import ListPortInfo
 
 from sts_jax.hardware import protocol
 
@@ -42,24 +43,9 @@ class DisconnectedError(LedError):
     """The port has vanished or is closed. `Leds.reconnect` searches for the controller again."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Port:
-    """A serial port of this machine."""
-
-    device: str  # name for `Leds.connect`, such as /dev/ttyACM0
-    description: str  # description by the operating system, may be empty
-    serial_number: str | None  # USB serial number, None: unknown. The controller's own one is `Leds.serial_number`
-    vendor: int | None  # number of the USB vendor, None: not a USB device
-    product: int | None  # number of the USB product, None: not a USB device
-
-
-def find_controllers() -> list[Port]:
+def find_controllers() -> list[ListPortInfo]:
     """List the serial ports, those of USB devices first. None is opened, because this restarts most boards."""
-    listed = [
-        Port(port.device, port.description or "", port.serial_number or None, port.vid, port.pid)
-        for port in list_ports.comports()
-    ]
-    return sorted(listed, key=lambda port: (port.vendor is None, port.device))
+    return sorted(list_ports.comports(), key=lambda port: (port.vid is None, port.device))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,7 +120,7 @@ class Leds:
 
         Some boards have the serial number in their USB descriptor, too. Their ports are tried first.
         """
-        ports = [port for port in find_controllers() if port.vendor is not None]
+        ports = [port for port in find_controllers() if port.vid is not None]
         ports.sort(key=lambda port: port.serial_number != serial_number)
         return cls(_search([port.device for port in ports], serial_number, timeout_s=5.0))
 
@@ -262,7 +248,7 @@ class Leds:
         """The names of the ports on which `reconnect` searches for the controller, in order."""
         names = [self.port]
         if (usb := self._connection.usb) is not None:
-            alike = [port for port in find_controllers() if (port.vendor, port.product) == (usb.vendor, usb.product)]
+            alike = [port for port in find_controllers() if (port.vid, port.pid) == (usb.vid, usb.pid)]
             alike.sort(key=lambda port: port.serial_number != usb.serial_number)
             names += [port.device for port in alike]
         return list(dict.fromkeys(names))
@@ -426,12 +412,12 @@ def _open_port(name: str) -> serial.Serial:
         raise LedError(f"cannot open {name}: {cause}. Ports found: {ports}.") from error
 
 
-def _usb_port(name: str) -> Port | None:
+def _usb_port(name: str) -> ListPortInfo | None:
     """The USB port that a device name refers to, or None if it is not a USB port."""
     target = os.path.realpath(name)
     for port in find_controllers():
         with contextlib.suppress(OSError):
-            if port.vendor is not None and os.path.realpath(port.device) == target:
+            if port.vid is not None and os.path.realpath(port.device) == target:
                 return port
     return None
 

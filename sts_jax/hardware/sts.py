@@ -109,8 +109,6 @@ class STS:
         *,
         camera: CameraConfig | str | None = None,
         leds: str | None = None,
-        timeout_s: float = 5.0,
-        reconnect_s: float = 30.0,
     ) -> "STS":
         """Make the sensor that a sensor file describes. `python -m experiments.commission` writes such files.
 
@@ -119,8 +117,6 @@ class STS:
             camera: Another source for the same camera, such as its URL with a password, or a whole configuration.
             leds: Name of the controller's port, needed for a port that is not a USB device. None: `connect` searches
                 all USB ports for the controller's serial number.
-            timeout_s: See `STS`.
-            reconnect_s: See `STS`.
 
         Raises:
             SensorFileError: The file is damaged, or has no description of a camera and lights.
@@ -136,8 +132,6 @@ class STS:
             levels=device.levels,
             settling=Settling(device.settle_off_s, device.settle_on_s),
             exposures=device.exposures if config.kind == "device" else None,
-            timeout_s=timeout_s,
-            reconnect_s=reconnect_s,
         )
         sensor.device = device
         return sensor
@@ -316,21 +310,17 @@ def choose_exposure(camera: OpenCVCamera, *, longest: float) -> Exposed:
     Returns:
         The exposure that is set now. At the driver's limits, the image may still be too dark or saturated.
     """
-    exposure = camera.set_exposure(min(camera.locked.get("exposure") or longest, longest))
-    for _ in range(_ATTEMPTS):
-        if exposure is None:
-            break
+    exposure, attempts = camera.set_exposure(min(camera.locked.get("exposure") or longest, longest)), 0
+    while exposure is not None:
         time.sleep(LAG_S)
         seen = brightness(camera.read().image)
-        if abs(seen - _WANTED) <= _TOLERANCE:
+        if abs(seen - _WANTED) <= _TOLERANCE or attempts == _ATTEMPTS:
             return Exposed(exposure, seen)
         factor = _DARKER if seen >= SATURATED else min(_WANTED / max(seen, 1.0), _MOST)
-        before, exposure = exposure, camera.set_exposure(min(max(exposure * factor, 1.0), longest))
+        before, attempts = exposure, attempts + 1
+        exposure = camera.set_exposure(min(max(exposure * factor, 1.0), longest))
         if exposure == before:
-            return Exposed(exposure, seen)
-    if exposure is None:
-        raise CameraError(
-            f"the driver of {camera.config.name} does not support a manual exposure: use its automatic exposure."
-        )
-    time.sleep(LAG_S)
-    return Exposed(exposure, brightness(camera.read().image))
+            return Exposed(before, seen)
+    raise CameraError(
+        f"the driver of {camera.config.name} does not support a manual exposure: use its automatic exposure"
+    )
