@@ -439,7 +439,7 @@ def test_devices_are_listed_with_the_next_command(config, monkeypatch, capsys):
         ({"pictures": 3}, "pictures is 3, but it must be >= 6"),
         ({"ruler": 10.0}, "ruler is 10 mm"),
         ({"every": -1.0}, "every is -1.0"),
-        ({"width": 0}, "width must be >= 1"),
+        ({"width": 0}, "width must be > 0"),
     ],
 )
 def test_bad_options_are_named(config, changes, message):

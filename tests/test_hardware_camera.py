@@ -347,7 +347,7 @@ def test_what_a_stream_cannot_do_is_named(server):
         ({"source": -1}, "index >= 0"),
         ({"source": ""}, "source is empty"),
         ({"height": None}, "both be None, got 160 x None"),
-        ({"width": 0}, "width must be >= 1, got 0"),
+        ({"width": 0}, "width must be > 0 and finite, got 0"),
         ({"timeout_s": float("inf")}, "timeout_s must be > 0 and finite"),
         ({"fourcc": "JPEGS"}, "four characters"),
     ],

@@ -4,7 +4,6 @@ import collections
 import contextlib
 import dataclasses
 import functools
-import math
 import re
 import statistics
 from pathlib import Path
@@ -129,13 +128,9 @@ class CameraConfig:
             raise ValueError("source is empty: give a device's index, a path or a URL")
         if (self.width is None) != (self.height is None):
             raise ValueError(f"width and height must both be given or both be None, got {self.width} x {self.height}")
-        for name in ("width", "height", "buffer"):
+        for name in ("width", "height", "fps", "timeout_s", "buffer", "frozen_after_s"):
             value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ValueError(f"{name} must be >= 1, got {value}")
-        for name in ("fps", "timeout_s", "frozen_after_s"):
-            value = getattr(self, name)
-            if value is not None and not (value > 0 and math.isfinite(value)):
+            if value is not None and not 0 < value < float("inf"):
                 raise ValueError(f"{name} must be > 0 and finite, got {value}")
         if self.fourcc is not None and len(self.fourcc) != 4:
             raise ValueError(f"fourcc must have four characters, such as 'MJPG', got {self.fourcc!r}")
