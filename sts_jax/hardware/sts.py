@@ -117,11 +117,6 @@ class STS:
             camera: Another source for the same camera, such as its URL with a password, or a whole configuration.
             leds: Name of the controller's port, needed for a port that is not a USB device. None: `connect` searches
                 all USB ports for the controller's serial number.
-
-        Raises:
-            SensorFileError: The file is damaged, or has no description of a camera and lights.
-            WrongDeviceError: The camera is not the camera that the file names. `connect` raises the same error for the
-                LED controller.
         """
         device = Device.load(path)
         config = camera if isinstance(camera, CameraConfig) else device.camera_config(camera)
