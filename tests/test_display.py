@@ -34,26 +34,22 @@ def same(left, right):
         np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.parametrize("name", ["frame.png", "frame.PNG"])
-def test_a_png_holds_both_streams_side_by_side(tmp_path, name):
-    sts.save(tmp_path / name, FRAME)
-    with Image.open(tmp_path / name) as picture:
+def test_a_png_holds_both_streams_side_by_side(tmp_path):
+    sts.save(tmp_path / "frame.PNG", FRAME)
+    with Image.open(tmp_path / "frame.PNG") as picture:
         got = np.asarray(picture) / 255
     np.testing.assert_allclose(got, np.concatenate([FRAME.visual, FRAME.tactile], 1), atol=0.51 / 255)
 
 
-@pytest.mark.parametrize("thing", [FRAME, BODY], ids=["frame", "body"])
+HIDDEN = sts.physics.Hidden(jnp.array([0.5]), jnp.array([1.0]), jnp.array([0.6]), jnp.array([[0.0, 0, 1]]))
+FIELDS = {name: jnp.full(1, float(k)) for k, name in enumerate(sts.physics.Trajectory._fields)}
+TRAJECTORY = sts.physics.Trajectory(**(FIELDS | {"hidden": HIDDEN}))
+
+
+@pytest.mark.parametrize("thing", [FRAME, BODY, TRAJECTORY], ids=["frame", "body", "trajectory"])
 def test_a_loaded_npz_equals_the_saved_object(tmp_path, thing):
     sts.save(tmp_path / "thing.npz", thing)
     same(sts.load(tmp_path / "thing.npz"), thing)
-
-
-def test_a_trajectory_keeps_its_hidden_values(tmp_path):
-    hidden = sts.physics.Hidden(jnp.array([0.5]), jnp.array([1.0]), jnp.array([0.6]), jnp.array([[0.0, 0, 1]]))
-    fields = {name: jnp.full(1, float(k)) for k, name in enumerate(sts.physics.Trajectory._fields)}
-    thing = sts.physics.Trajectory(**(fields | {"hidden": hidden}))
-    sts.save(tmp_path / "falls.npz", thing)
-    same(sts.load(tmp_path / "falls.npz"), thing)
 
 
 def test_a_damaged_file_raises_an_error_unless_the_damage_is_outside_the_arrays(tmp_path):
@@ -89,10 +85,7 @@ def test_a_file_of_another_format_raises_an_error(tmp_path):
     ("thing", "panels"),
     [
         (FRAME, ["visual", "tactile", "depth (mm)", "pressure (kPa)"]),
-        (
-            sts.Prediction(FRAME.visual, FRAME.tactile, None, jnp.zeros(2), jnp.zeros(2)),
-            ["predicted visual", "predicted tactile"],
-        ),
+        (PREDICTION, ["predicted visual", "predicted tactile"]),
         (FRAME.visual, [""]),
         (np.zeros((4, 5, 3), np.uint8), [""]),
     ],
@@ -120,11 +113,8 @@ def test_a_body_is_drawn_from_outside():
     ("path", "thing", "error", "message"),
     [
         ("a.npz", np.zeros((2, 2, 3)), TypeError, r"a ndarray, but only a .* Trajectory can be written to an \.npz"),
-        ("a.png", 3.0, TypeError, "`thing` is a float, but `show` draws"),
         ("a.png", BODY, TypeError, r"`thing` is a Body, .* and a \.png file has a Frame or an image"),
-        ("a.png", np.zeros((2, 2)), ValueError, r"shape \(2, 2\)"),
         ("a.png", np.full((2, 2, 3), 2.0), ValueError, r"in \[2.0, 2.0\]"),
-        ("a.png", np.full((2, 2, 3), np.nan), ValueError, "must be uint8 or floats"),
         ("a.jpg", FRAME, ValueError, r"must end in \.npz"),
         ("a.png", jax.tree.map(lambda x: x[None], FRAME), ValueError, r"leading axes \(1,\)"),
     ],

@@ -9,7 +9,6 @@ import numpy as np
 import optax
 import pytest
 from extending_page import DOCS, blocks
-from jaxtyping import TypeCheckError
 
 import sts_jax as sts
 from sts_jax import dataset, evaluation, training
@@ -60,7 +59,6 @@ def test_pairs_have_the_measured_values_and_their_copies_turn(data):
     [
         ({"measure": lambda data, rows: np.zeros((len(rows), 6))}, r"`measure` returned .* \(2, 6\).* \(2, 2, 6\)"),
         ({"measure": lambda data, rows: np.full((len(rows), 2, 6), np.inf)}, "`measure` returned infinite numbers"),
-        ({"measure": lambda data, rows: np.full((len(rows), 2, 6), "a")}, "`measure` returned values of type <U1"),
         (
             {"shape": (4, 4, 1), "measure": lambda data, rows: np.full((len(rows), 2, 4, 4, 1), 37.0)},
             r"return values in \[0, 1\]",
@@ -78,11 +76,8 @@ def test_a_wrong_function_of_a_measurement_is_named(data, changes, message):
     ("fields", "message"),
     [
         ({"name": "pose"}, "name of a measurement is 'pose'"),
-        ({"name": "a b"}, "name of a measurement is 'a b'"),
         ({"shape": (4, 4)}, r"shape is \(4, 4\)"),
-        ({"shape": (0,)}, r"shape is \(0,\)"),
         ({"scale": 0.0}, "scale is 0.0, but it must be > 0"),
-        ({"weight": float("inf")}, "weight is inf"),
         ({"shape": (32, 32, 3), "scale": 2.0}, "an image needs no scale"),
     ],
 )
@@ -125,23 +120,17 @@ def pairs_of(first, measurements=(LOAD,)):
     )
 
 
-def trained(folder, pairs, measurements=(LOAD,), steps=300, modalities=()):
+def trained(folder, pairs, measurements=(LOAD,), steps=300):
     preprocessing = training.Preprocessing((32, 32))
-    arrays, preprocessing = training.frame_arrays(pairs, modalities, preprocessing, NOTHING, measurements=measurements)
-    model = training.paper_model(modalities, preprocessing, measurements=measurements)
+    arrays, preprocessing = training.frame_arrays(pairs, (), preprocessing, NOTHING, measurements=measurements)
+    model = training.paper_model((), preprocessing, measurements=measurements)
     model = dataclasses.replace(model, latent=8, hidden=32, widths=(4, 4, 4, 4))
     training.save_blank(folder, NOTHING, NOTHING)
     config = training.TrainConfig(
         steps=steps, batch_size=50, learning_rate=1e-2, encoder_epsilon=1e-3, log_every=steps, checkpoint_every=steps
     )
-    training.train(
-        config,
-        model,
-        arrays,
-        workdir=folder,
-        absent=preprocessing.absent,
-        preprocessing=dataclasses.asdict(preprocessing),
-    )
+    fields = dataclasses.asdict(preprocessing)
+    training.train(config, model, arrays, workdir=folder, absent=preprocessing.absent, preprocessing=fields)
     return sts.Predictor.load(folder)
 
 
@@ -155,38 +144,31 @@ def test_a_predictor_takes_and_returns_a_measurement_in_its_unit(predictor, tmp_
     first = np.random.default_rng(1).uniform(0, 100, (6, 4, 1)).astype(np.float32)
     truth = 3 * first - 20
     assert predictor.modalities == ("load",)
-    found = predictor(measurements={"load": first}, key=jax.random.key(0), num_samples=2)
-    assert np.mean((np.asarray(found.measurements["load"]) - truth) ** 2) < 0.05 * truth.var()
-    assert found.samples.measurements["load"].shape == (2, 6, 4, 1)
-    assert "load=float32[6, 4, 1]" in repr(found)
-    one = jax.jit(lambda x: predictor(measurements={"load": x}).measurements["load"])(jnp.asarray(first[0, 0]))
-    np.testing.assert_allclose(one, found.measurements["load"][0, 0], rtol=1e-4)
+    prediction = predictor(measurements={"load": first}, key=jax.random.key(0), num_samples=2)
+    assert np.mean((np.asarray(prediction.measurements["load"]) - truth) ** 2) < 0.05 * truth.var()
+    assert prediction.samples.measurements["load"].shape == (2, 6, 4, 1)
+    # A traced value that is not finite gives NaN in its item alone.
+    traced = jax.jit(lambda x: predictor(measurements={"load": x}).measurements["load"])(
+        jnp.asarray(first[0]).at[1].set(jnp.nan)
+    )
+    np.testing.assert_array_equal(np.isnan(traced[:, 0]), [False, True, False, False])
+    np.testing.assert_allclose(traced[0], prediction.measurements["load"][0, 0], rtol=1e-4)
     predictor.save(tmp_path / "copy")
     again = sts.Predictor.load(tmp_path / "copy")(measurements={"load": first})
-    np.testing.assert_array_equal(again.measurements["load"], found.measurements["load"])
-
-
-def test_an_invalid_traced_measurement_gives_nan_in_its_item_alone(predictor):
-    values = jnp.array([[10.0], [jnp.nan], [30.0]])
-    call = jax.jit(lambda x: predictor(measurements={"load": x}, key=jax.random.key(0), num_samples=2))
-    found = call(values)
-    np.testing.assert_array_equal(np.isnan(found.measurements["load"][:, 0]), [False, True, False])
-    np.testing.assert_array_equal(np.isnan(found.samples.measurements["load"][1, :, 0]), [False, True, False])
+    np.testing.assert_array_equal(again.measurements["load"], prediction.measurements["load"])
 
 
 @pytest.mark.parametrize(
-    ("measurements", "error", "message"),
+    ("measurements", "message"),
     [
-        ({"load": np.zeros(2, np.float32)}, ValueError, r"load has shape \(2,\), but .* needs shape \(\.\.\., 1\)\.$"),
-        ({"load": np.full(1, np.nan, np.float32)}, ValueError, "load has NaN or infinite values"),
-        ({"load": np.zeros(1, np.int32)}, ValueError, r"load is int32, but it must be floating-point\.$"),
-        ({"sound": np.zeros(1, np.float32)}, ValueError, "does not accept sound: it was trained on load"),
-        ([1.0], TypeCheckError, "measurements"),
-        ({}, ValueError, "nothing to predict from: give at least one of load"),
+        ({"load": np.zeros(2, np.float32)}, r"load has shape \(2,\), but .* needs shape \(\.\.\., 1\)\.$"),
+        ({"load": np.full(1, np.nan, np.float32)}, "load has NaN or infinite values"),
+        ({"sound": np.zeros(1, np.float32)}, "does not accept sound: it was trained on load"),
+        ({}, "nothing to predict from: give at least one of load"),
     ],
 )
-def test_a_wrong_measurement_is_named(predictor, measurements, error, message):
-    with pytest.raises(error, match=message):
+def test_a_wrong_measurement_is_named(predictor, measurements, message):
+    with pytest.raises(ValueError, match=message):
         predictor(measurements=measurements)
 
 
@@ -196,41 +178,32 @@ def test_values_that_were_not_measured_are_masked():
         values[0, 0], values[1, 1] = np.nan, np.nan
         return values
 
-    def never_at_first(data, rows):
-        values = loads(data, rows)
-        values[:, 0] = np.nan
-        return values
-
-    part = dataclasses.replace(LOAD, measure=some)
-    late = dataclasses.replace(LOAD, name="late", measure=never_at_first)
-    pairs = pairs_of(np.array([10.0, 20.0, 30.0]), (part, late))
-    arrays, preprocessing = training.frame_arrays(
-        pairs, (), training.Preprocessing((32, 32)), NOTHING, measurements=(part, late)
-    )
+    late = dataclasses.replace(LOAD, name="late", measure=lambda *given: loads(*given) * [[[np.nan], [1]]])
+    parts = (dataclasses.replace(LOAD, measure=some), late)
+    pairs = pairs_of(np.array([10.0, 20.0, 30.0]), parts)
+    preprocessing = training.Preprocessing((32, 32))
+    arrays, preprocessing = training.frame_arrays(pairs, (), preprocessing, NOTHING, measurements=parts)
     assert preprocessing.absent == ("late",)
-    assert preprocessing.scales == (("load", 50.0), ("late", 50.0))
     assert training.Preprocessing.from_json(dataclasses.asdict(preprocessing)) == preprocessing
     assert set(arrays.inputs) == {"load"}
     np.testing.assert_array_equal(arrays.present["load"], [False, True, True])
     np.testing.assert_array_equal(arrays.target_present["load"], [True, False, True])
     np.testing.assert_allclose(arrays.targets["late"][:, 0], np.array([10, 40, 70]) / 50)
 
-    model = training.paper_model((), preprocessing, measurements=(part, late))
-    learner = training.learner(model, absent=preprocessing.absent)
+    learner = training.learner(training.paper_model((), preprocessing, measurements=parts), absent=preprocessing.absent)
     learner.check(arrays)
     graphdef, params, stats = learner.init(jax.random.key(0))
 
+    @jax.value_and_grad
     def loss(params, arrays):
         batch = jax.tree.map(jnp.asarray, arrays.take(np.arange(3)))
         return learner.loss(graphdef, params, stats, jax.random.key(1), batch, jnp.float32(1))[0]
 
-    filled = jax.tree.map(lambda x: np.nan_to_num(x, nan=123.0), vars(arrays))
-    values, gradients = zip(
-        *(jax.value_and_grad(loss)(params, own) for own in (arrays, training.Arrays(**filled))), strict=True
-    )
-    assert np.isfinite(values[0])
-    assert values[0] == values[1]
-    assert float(optax.tree.norm(gradients[0])) == pytest.approx(float(optax.tree.norm(gradients[1])), rel=1e-6)
+    filled = training.Arrays(**jax.tree.map(lambda x: np.nan_to_num(x, nan=123.0), vars(arrays)))
+    (value, gradient), (same, again) = loss(params, arrays), loss(params, filled)
+    assert np.isfinite(value)
+    assert value == same
+    assert float(optax.tree.norm(gradient)) == pytest.approx(float(optax.tree.norm(again)), rel=1e-6)
 
 
 def test_measurements_are_scored_against_the_truth_and_the_baselines(predictor):
@@ -247,22 +220,20 @@ def test_measurements_are_scored_against_the_truth_and_the_baselines(predictor):
     rows["model"] = evaluation.predict(predictor, ("load",), test, scenario)
     judge = evaluation.scorer(scenario, train, metrics=(metric,))
     scores = {name: judge(row, test) for name, row in rows.items()}
-    summary = evaluation.summarise(scores, test, metrics=(metric,), num=20)
+    summary = evaluation.summarise(scores, test, metrics=(metric,), num=20)["predictors"]
+    errors = {name: row["load_error"] and row["load_error"]["value"] for name, row in summary.items()}
     truth = 3 * first[1:] - 20
-    found = {name: own["load_error"] and own["load_error"]["value"] for name, own in summary["predictors"].items()}
     constant, copy, neighbour, below = evaluation.BASELINES
-    assert found[constant] == pytest.approx(np.abs(truth - 55).mean())  # 55: the mean of 3 * 10 - 20 and 3 * 40 - 20
-    assert found[copy] == pytest.approx(np.abs(truth - first[1:]).mean())
-    assert found[neighbour] == pytest.approx(np.abs(truth - 10).mean())  # all images are equal
-    assert found[below] is None
+    assert errors[constant] == pytest.approx(np.abs(truth - 55).mean())  # 55: the mean of 3 * 10 - 20 and 3 * 40 - 20
+    assert errors[copy] == pytest.approx(np.abs(truth - first[1:]).mean())
+    assert errors[neighbour] == pytest.approx(np.abs(truth - 10).mean())  # all images are equal
+    assert errors[below] is None
+    predicted = np.asarray(predictor(measurements={"load": first[:, None]}).measurements["load"])[1:, 0]
+    assert errors["model"] == pytest.approx(np.abs(truth - predicted).mean(), rel=1e-4)
+    assert metric.title == "load error (N)"
     late = test._replace(measurements={"load": np.where([[[True], [False]]], np.nan, test.measurements["load"])})
     filled = evaluation.baselines(scenario, train, late)[copy].measurements["load"]
     np.testing.assert_allclose(filled, 55)  # the first frames were not measured
-    few = evaluation.score(evaluation.first(rows["model"], 2), test, metrics=(metric,))
-    assert few["load_error"].shape == (2,)
-    own = np.asarray(predictor(measurements={"load": first[:, None]}).measurements["load"])[1:, 0]
-    assert found["model"] == pytest.approx(np.abs(truth - own).mean(), rel=1e-4)
-    assert metric.title == "load error (N)"
     with pytest.raises(ValueError, match=r"`inputs` contains 'load', but `test\.measurements` does not: make"):
         evaluation.predict(predictor, ("load",), test._replace(measurements={}), scenario)
 
@@ -279,12 +250,11 @@ def test_a_further_image_is_predicted_in_the_unit_interval(tmp_path):
     pairs = pairs_of(first, (LOAD, heat))
     pairs = pairs._replace(measurements=pairs.measurements | {"heat": heats(first, np.arange(100))})
     predictor = trained(tmp_path, pairs, (LOAD, heat), steps=200)
-    found = predictor(measurements={"load": np.array([[10.0], [90.0]], np.float32)}).measurements["heat"]
-    assert found.shape == (2, 32, 32, 1)
-    assert 0 <= float(found.min()) <= float(found.max()) <= 1
-    np.testing.assert_allclose(found.mean((1, 2, 3)), [0.1, 0.9], atol=0.1)
-    seen = predictor(measurements={"heat": pairs.measurements["heat"][:4, 0] / np.float32(255)}).measurements["load"]
-    np.testing.assert_allclose(seen[:, 0], 3 * first[:4] - 20, atol=40)
+    image = predictor(measurements={"load": np.array([[10.0], [90.0]], np.float32)}).measurements["heat"]
+    assert image.shape == (2, 32, 32, 1)
+    np.testing.assert_allclose(image.mean((1, 2, 3)), [0.1, 0.9], atol=0.1)
+    load = predictor(measurements={"heat": pairs.measurements["heat"][:4, 0] / np.float32(255)}).measurements["load"]
+    np.testing.assert_allclose(load[:, 0], 3 * first[:4] - 20, atol=40)
     with pytest.raises(ValueError, match="heat has values in"):
         predictor(measurements={"heat": np.full((32, 32, 1), 255.0, np.float32)})
 

@@ -15,17 +15,6 @@ from sts_jax.objects import colors, shapes
 NUMBER = 1
 
 
-@pytest.fixture
-def code(tmp_path, monkeypatch) -> list[str]:
-    """The code of the page after its first block, which becomes the module `torus` in the working directory."""
-    module, *rest = blocks("A ninth object class")
-    (tmp_path / "torus.py").write_text(module)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(sys.modules, "torus", raising=False)
-    return rest
-
-
 def ring(rng: np.random.Generator) -> list[shapes.Part]:
     path = np.column_stack([shapes.circle(30.0, 48), np.zeros(48)])
     rings = shapes.sweep(path, shapes.circle(10.0, 24), (0, 0, 1), closed=True)
@@ -35,12 +24,13 @@ def ring(rng: np.random.Generator) -> list[shapes.Part]:
 RING = objects.Family("ring", seed=9, parts=ring)
 
 
-def test_a_family_gives_the_same_object_by_its_name_and_as_a_value():
-    one = objects.make(jax.random.key(3), f"{__name__}:RING")
-    other = objects.make(jax.random.key(3), objects.find_family(f"{__name__}:RING"))
-    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
-        np.testing.assert_array_equal(a, b)
+def test_a_family_makes_the_same_object_by_its_name_and_as_a_value_and_others_with_another_seed():
+    key = jax.random.key(3)
+    one, same = objects.make(key, f"{__name__}:RING"), objects.make(key, RING)
+    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(same), strict=True))
     assert int(one.category) == -1
+    other = objects.make(key, objects.Family("ring", seed=10, parts=ring))
+    assert np.abs(np.asarray(one.colors[0] - other.colors[0])).max() > 0.01
 
 
 def test_area_volume_and_inertia_of_a_torus_are_the_closed_form():
@@ -55,19 +45,10 @@ def test_area_volume_and_inertia_of_a_torus_are_the_closed_form():
     np.testing.assert_allclose(np.ptp(np.asarray(body.vertices), axis=0), [0.08, 0.08, 0.02], rtol=0.01)
 
 
-def test_families_with_different_seeds_draw_different_numbers():
-    same, other = (objects.Family("ring", seed=seed, parts=ring) for seed in (9, 10))
-    key = jax.random.key(0)
-    colour = [np.asarray(objects.make(key, family).colors[0]) for family in (RING, same, other)]
-    np.testing.assert_array_equal(colour[0], colour[1])
-    assert np.abs(colour[0] - colour[2]).max() > 0.01
-
-
 @pytest.mark.parametrize(
     ("category", "message"),
     [
         ("teapot", r"category is 'teapot', but it must be one of bottle, .*watch, or 'module:NAME'"),
-        ("torus:", "category is 'torus:', but it must be one of"),
         ("no_such_module:RING", "module no_such_module cannot be imported .*No module named .*: install it, or start"),
         (f"{__name__}:NUMBER", "variable NUMBER of .* is of type int: assign a Family"),
         (f"{__name__}:ROUND", "variable ROUND of .*test_extending_objects does not exist: assign"),
@@ -88,7 +69,6 @@ def test_an_unknown_category_is_refused_before_anything_is_collected(tmp_path, c
         (lambda parts: [], r"family bad: parts\(\) must return at least one Part, got none"),
         (lambda parts: parts * 2, r"family bad: at most one part can have interior=True, got 2"),
         (lambda parts: shapes.scaled(parts, 0.08), r"longest side must be 5 to 150 mm, got 0\.08 mm: .*millimetres"),
-        (lambda parts: shapes.scaled(parts, 160), "longest side must be 5 to 150 mm, got 160 mm"),
         (lambda parts: shapes.scaled(parts, np.nan), "all vertices must be finite, got nan"),
         (lambda parts: [part._replace(interior=False) for part in parts] * 60, "138,240 faces .* at most 131,072"),
     ],
@@ -99,26 +79,22 @@ def test_parts_that_make_no_body_are_refused(change, message):
         objects.make(jax.random.key(0), bad)
 
 
-@pytest.mark.parametrize("seed", [-1, True])
-def test_an_invalid_seed_is_refused(seed):
-    with pytest.raises(ValueError, match=f"family ring: seed must be a whole number >= 0, got {seed!r}"):
-        objects.Family("ring", seed, ring)
-
-
 @pytest.mark.slow
-def test_the_code_of_the_page_simulates_renders_and_collects_the_new_class(code):
+def test_the_code_of_the_page_simulates_renders_and_collects_the_new_class(tmp_path, monkeypatch):
+    module, *code = blocks("A ninth object class")
+    (tmp_path / "torus.py").write_text(module)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "torus", raising=False)
     names: dict = {}
     for block in code:
         exec(block, names)
     assert names["fall"].pose.shape == (4, 60, 7)
-    seen = np.asarray(names["frame"].segmentation)
-    assert 0.01 < seen.mean() < 0.6
+    assert 0.01 < np.asarray(names["frame"].segmentation).mean() < 0.6
     data, collection = names["data"], names["collection"]
     assert dataset.class_names(collection) == ("bottle", "torus:TORUS") * 3
     assert data.collection["categories"] == ["bottle", "torus:TORUS"]
-    np.testing.assert_array_equal(data.trajectory["body"], np.arange(6))
     pairs = data.pairs(np.arange(6))
     body = objects.make(jax.random.fold_in(jax.random.key(collection.seed), 1), "torus:TORUS")
     np.testing.assert_array_equal(pairs.support[1], objects.support(body))
-    assert pairs.visual.std(axis=(2, 3)).min() > 0
     assert dataset.collect(collection, names["sensor"], Path("rings")) == dataset.Collected(0, ())  # nothing to do

@@ -2,7 +2,6 @@
 
 import dataclasses
 import enum
-import inspect
 import json
 import math
 
@@ -11,12 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from extending_page import blocks
-from PIL import Image
 
 import sts_jax as sts
 from experiments import perturbed
 from experiments.shared import run
-from sts_jax import dataset, evaluation, geometry, physics
+from sts_jax import dataset, physics
 
 ENGINES = ["mujoco", pytest.param("mjx", marks=pytest.mark.slow)]
 FRICTION = 0.4
@@ -45,17 +43,14 @@ def block() -> sts.objects.Body:
     )
 
 
-def hidden(num: int) -> physics.Hidden:
-    """Empty objects with a known friction."""
-    ones = np.ones(num, np.float32)
-    return physics.Hidden(0 * ones, ones, FRICTION * ones, np.tile(np.float32([0, 0, 1]), (num, 1)))
-
-
 def simulated(scenario, body, num, engine):
-    found = physics.simulate(
-        jax.random.key(1), body, sts.Sensor(), scenario, num, hidden=hidden(num), chunk=num, engine=engine
+    """Trajectories of empty objects with a known friction."""
+    ones = np.ones(num, np.float32)
+    hidden = physics.Hidden(0 * ones, ones, FRICTION * ones, np.tile(np.float32([0, 0, 1]), (num, 1)))
+    trajectory = physics.simulate(
+        jax.random.key(1), body, sts.Sensor(), scenario, num, hidden=hidden, chunk=num, engine=engine
     )
-    return jax.tree.map(np.asarray, found)
+    return jax.tree.map(np.asarray, trajectory)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -100,13 +95,13 @@ def test_a_block_on_a_tilting_pad_slides_as_a_float64_loop_does(page, block, eng
 
 def test_outcomes_of_the_scenario_have_names_and_are_counted(page):
     scenario, rolled = page["Rolled"](), page["rolled"]
-    assert {int(one) for one in rolled.outcome} <= {int(one) for one in scenario.outcomes}
     assert [scenario.named(number) for number in (1, 100, 101)] == ["fell off", "stops early", "rolls on"]
     np.testing.assert_array_equal(rolled.outcome, jax.vmap(scenario.outcome)(rolled.pose[:, 0], rolled.pose[:, -1]))
     text = repr(rolled._replace(outcome=np.repeat(np.int32([100, 1]), [5, 3])))
     assert "5 outcome 100, 3 fell off" in text
-    with pytest.raises(ValueError, match="100 is not a valid Outcome"):
-        _ = rolled._replace(outcome=np.int32([100])).outcomes
+    assert physics.variant(scenario, "wide-friction") == dataclasses.replace(scenario, friction=(0.3, 0.9))
+    with pytest.raises(ValueError, match="needs the fields fill, shell_scale, tilt in Rolled"):
+        physics.variant(scenario, "off")
 
 
 TAKEN = enum.IntEnum("Taken", {"STOPS": 0})
@@ -134,58 +129,22 @@ def test_mistakes_in_a_scenario_are_named(page, changes, match):
         physics.simulate(jax.random.key(0), page["bottle"], sts.Sensor(), wrong())
 
 
-def test_a_scenario_that_is_no_frozen_dataclass_is_refused(page):
-    for wrong in (dataclasses.make_dataclass("Thawed", [])(), page["Rolled"]):
-        with pytest.raises(TypeError, match=r"a frozen dataclass that derives from physics\.Scenario"):
-            inspect.unwrap(physics.simulate)(jax.random.key(0), page["bottle"], sts.Sensor(), wrong)
-
-
-def test_a_variant_needs_the_fields_that_it_changes(page):
-    scenario = page["Rolled"]()
-    assert physics.variant(scenario, "wide-friction") == dataclasses.replace(scenario, friction=(0.3, 0.9))
-    with pytest.raises(ValueError, match="needs the fields fill, shell_scale, tilt in Rolled"):
-        physics.variant(scenario, "off")
-
-
-@pytest.fixture(scope="module")
-def collected(page, tmp_path_factory) -> dict[str, tuple[physics.Scenario, dataset.Dataset]]:
-    """A dataset of two trajectories of each scenario."""
-    tiny = {"categories": ("bottle",), "num_objects": 2, "num_per_object": 1, "num_full": 0, "objects_per_shard": 2}
-    found = {}
-    for name in ("Rolled", "Tilting"):
-        scenario, folder = page[name](frames=2), tmp_path_factory.mktemp(name)
-        dataset.collect(dataset.Collection(scenario, **tiny), sts.Sensor(), folder)
-        found[name] = scenario, dataset.load(folder)
-    return found
-
-
 @pytest.mark.parametrize(("name", "vectors"), [("Rolled", 1), ("Tilting", 0)])
-def test_a_dataset_turns_the_vectors_of_a_condition_and_keeps_its_numbers(collected, name, vectors):
-    scenario, data = collected[name]
-    assert data.collection["scenario"]["name"] == name
-    assert data.collection["scenario"].get("vectors", 1) == vectors
+def test_a_dataset_turns_the_vectors_of_a_condition_and_keeps_its_numbers(page, tmp_path, name, vectors):
+    scenario = page[name](frames=2)
+    collection = dataset.Collection(scenario, ("bottle",), num_objects=2, num_per_object=1, num_full=0)
+    dataset.collect(collection, sts.Sensor(), tmp_path)
+    data = dataset.load(tmp_path)
     pairs, condition = data.pairs(np.array([0]), symmetries=True), data.trajectory["condition"][0]
-    for own, symmetry in zip(pairs.condition, scenario.symmetries, strict=True):
+    for copy, symmetry in zip(pairs.condition, scenario.symmetries, strict=True):
         mirror = np.diag([1.0, -1.0 if symmetry >= 4 else 1.0])
         quarter = np.linalg.matrix_power(np.array([[0.0, -1.0], [1.0, 0.0]]), symmetry % 4)
-        np.testing.assert_allclose(own, quarter @ mirror @ condition if vectors else condition, atol=1e-6)
-
-
-@pytest.mark.parametrize(("name", "has_arrows"), [("Rolled", True), ("Tilting", False)])
-def test_the_figure_of_predictions_shows_velocities_as_red_arrows(collected, name, has_arrows, tmp_path):
-    scenario, data = collected[name]
-    pairs = data.pairs(np.array([0, 1]))
-    predicted = evaluation.Predicted(visual=pairs.visual[:, 1] / 255)
-    path = tmp_path / "a.png"
-    evaluation.figures.predictions(path, pairs, predicted, num=2, title="t", scenario=scenario)
-    red, green, blue = np.moveaxis(np.asarray(Image.open(path).convert("RGB")).astype(int), -1, 0)
-    assert ((red > 200) & (green < 60) & (blue < 60)).any() == has_arrows
+        np.testing.assert_allclose(copy, quarter @ mirror @ condition if vectors else condition, atol=1e-6)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["Rolled", "Tilting"])
-def test_the_stages_of_an_experiment_train_and_evaluate_a_new_scenario(page, name, tmp_path):
-    scenario = page[name](frames=16)
+def test_the_stages_of_an_experiment_train_and_evaluate_a_new_scenario(page, tmp_path):
+    scenario = page["Rolled"](frames=16)
     collection = dataclasses.replace(
         perturbed.SMOKE.collection, scenario=scenario, num_objects=10, num_per_object=2, num_full=1, num_rendered=1
     )
@@ -202,13 +161,3 @@ def test_the_stages_of_an_experiment_train_and_evaluate_a_new_scenario(page, nam
     assert set(summary["outcomes"]) <= {outcome.name.lower() for outcome in scenario.outcomes}
     assert sum(summary["outcomes"].values()) == summary["items"]
     assert any(title.startswith("state-space model") for title in summary["predictors"])
-
-
-def test_a_given_start_has_the_velocity_of_its_condition(page):
-    scenario, bodies = page["Rolled"](frames=4), [page["bottle"]]
-    first = physics.simulate(jax.random.key(3), bodies, sts.Sensor(), scenario, 2)
-    start = physics.Start(first.pose[:, 0], jnp.asarray(scenario.steps), first.condition)
-    again = physics.simulate(jax.random.key(4), bodies, sts.Sensor(), scenario, 2, start=start)
-    np.testing.assert_allclose(again.velocity[:, 0], first.velocity[:, 0], atol=1e-6)
-    np.testing.assert_allclose(again.pose[:, 0], first.pose[:, 0], atol=1e-6)
-    assert np.all(geometry.norm(again.velocity[:, 0, :2]) > 0.04)

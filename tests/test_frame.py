@@ -107,9 +107,8 @@ def test_images_are_empty_after_an_object_has_fallen_off(crop):
     far = sense(SENSOR, ball(), at(5.0, 0.0, 0.1), weight(0, 0, 0), resolution=resolution, crop=crop)
     assert not np.any(gone.segmentation)
     assert np.all(np.isinf(gone.depth))
-    assert np.array_equal(gone.visual, far.visual)
-    assert np.array_equal(gone.tactile, far.tactile)
-    assert np.array_equal(gone.window, far.window)
+    for name in ("visual", "tactile", "window"):
+        assert np.array_equal(getattr(gone, name), getattr(far, name))
     assert np.array_equal(
         np.round(np.asarray(gone.tactile)[20:-20, 20:-20] * 255),
         np.broadcast_to([178, 178, 204], (resolution[0] - 40, resolution[1] - 40, 3)),
@@ -140,27 +139,6 @@ def test_a_non_finite_input_gives_an_unbalanced_frame_with_finite_images(bad, wh
 
 
 @pytest.mark.slow
-def test_a_crop_agrees_with_the_whole_image():
-    body = letter()
-    pose, wrench = at(0.02, -0.01, 0.0), weight(1.0, 0.02, -0.01)
-    crop = sense(SENSOR, body, pose, wrench, resolution=(200, 200), crop=True)
-    whole = sense(SENSOR, body, pose, wrench, resolution=(640, 640))
-    np.testing.assert_allclose(crop.pose, whole.pose)
-    np.testing.assert_allclose(crop.pressure, whole.pressure)
-    left, top, width, height = np.asarray(crop.window)
-    assert width == pytest.approx(height)
-    # The pixel of the whole image under each pixel of the crop.
-    u = ((left + (np.arange(200) + 0.5) / 200 * width) + 0.075) / 0.15 * 640 - 0.5
-    v = ((top + (np.arange(200) + 0.5) / 200 * height) + 0.075) / 0.15 * 640 - 0.5
-    under = np.asarray(whole.visual)[np.round(v).astype(int)][:, np.round(u).astype(int)]
-    assert np.median(np.abs(under - np.asarray(crop.visual)).max(-1)) < 0.005
-    # The plate is 50 mm wide and at least 100 mm away. It fills the crop to its edge.
-    seen = np.asarray(crop.segmentation)
-    assert seen[:, 1:-1].any(0).all()
-    assert seen.mean() > 0.8
-
-
-@pytest.mark.slow
 def test_vmap_agrees_with_single_frames():
     poses = jnp.stack([at(0.01 * k, -0.005 * k, 0.029) for k in range(3)])
     wrenches = jnp.stack([weight(0.3 * k, 0.01 * k, -0.005 * k) for k in range(3)])
@@ -187,12 +165,9 @@ def test_touch_equals_the_tactile_image_of_the_same_imprint(crop):
     inner = np.s_[6:-6, 6:-6]  # near its border, a frame also shows effects of the imprint beyond it
     np.testing.assert_allclose(np.asarray(drawn)[inner], np.asarray(frame.tactile)[inner], atol=2e-3)
     if not crop:
-        np.testing.assert_array_equal(sts.touch(sensor, imprint), sts.touch(sensor, imprint, frame.window))
-
-
-def test_touch_of_an_imprint_with_nan_is_finite():
-    imprint = jnp.full((20, 30), jnp.nan).at[5:9, 6:12].set(0.1)
-    assert np.isfinite(np.asarray(sts.touch(sts.Sensor(), imprint))).all()
+        np.testing.assert_array_equal(sts.touch(sensor, imprint), drawn)
+    damaged = jnp.full((20, 30), jnp.nan).at[5:9, 6:12].set(0.1)
+    assert np.isfinite(np.asarray(sts.touch(sensor, damaged))).all()
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from optics_bodies import at, from_trimesh, weight
 import sts_jax as sts
 from sts_jax import optics, tactile
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("strict_ranks")]
+pytestmark = pytest.mark.usefixtures("strict_ranks")
 
 SHAPE = (40, 40)
 STEP = 1e-5  # length of a step, over a visible change of the parameter
@@ -109,11 +109,17 @@ def directions(point):
             yield f"{name}[{k}]", structure.unflatten(zeros)
 
 
-def compare(point, body, crop):
-    """For every leaf and stream: derivative, finite difference, and a mask of the values that have a derivative."""
+def compare(point, body, crop, together=False):
+    """For every leaf and stream: derivative, finite difference, and a mask of the values that have a derivative.
+
+    `together` compares the derivative along the sum of the directions of all leaves instead.
+    """
     with jax.enable_x64(True):
         point, body = double(point), double(body)
-        for name, tangent in directions(point):
+        ways = list(directions(point))
+        if together:
+            ways = [("all", functools.reduce(lambda a, b: jax.tree.map(jnp.add, a, b), [way for _, way in ways]))]
+        for name, tangent in ways:
             here, along = pushed(point, body, tangent, crop)
             ahead, behind = (
                 pushed(jax.tree.map(lambda v, t, s=s: v + s * STEP * t, point, tangent), body, tangent, crop)[0]
@@ -154,6 +160,17 @@ POINTS = {
 }
 
 
+def test_the_derivative_along_all_parameters_together_equals_finite_differences():
+    sensor, body, pose, wrench, crop, _ = POINTS["ball"]
+    for _, stream, slope, numeric, defined in compare((SENSORS[sensor], pose, wrench), body, crop, together=True):
+        assert np.mean(defined) > 0.95, stream
+        slope, numeric = slope[defined], numeric[defined]
+        largest = np.abs(numeric).max()
+        assert largest > SETTLED, stream
+        assert np.all(np.abs(slope - numeric) <= RELATIVE * (np.abs(numeric) + largest) + SETTLED), stream
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", POINTS)
 def test_derivatives_equal_finite_differences(name):
     sensor, body, pose, wrench, crop, more = POINTS[name]
@@ -188,6 +205,7 @@ FINITE = {
 }
 
 
+@pytest.mark.slow
 def test_gradients_by_all_leaves_are_finite():
     sensor = SENSORS["far"]
     # Also the paper's lights, which lie in the gel's plane.

@@ -36,52 +36,28 @@ IMPRINT = np.zeros((4, 5), np.float32)
 # A call, the type of its error, and a part of the message.
 BAD_CALLS = [
     (lambda: sense(SENSOR, BODY, POSE, resolution=(0, 64)), ValueError, r"resolution .* must be > 0, got \(0, 64\)"),
-    (lambda: sense(SENSOR, BODY, POSE, resolution=(64.0, 64)), TypeError, "parameter 'resolution'"),
-    (lambda: sense(SENSOR, BODY, POSE, resolution=64), TypeError, "parameter 'resolution'"),
-    (lambda: sense(SENSOR, BODY, POSE[:6]), TypeError, "parameter 'pose'"),
     (lambda: sense(SENSOR, BODY, POSE[None]), TypeError, "parameter 'pose'"),
-    (lambda: sense(SENSOR, BODY, None), TypeError, "parameter 'pose'"),
     (
         lambda: sense(SENSOR, BODY, sts.physics.rest.Placement(POSE, WRENCH)),
         TypeError,
         r"is a Placement: unpack it .*\*",
     ),
     (lambda: sense(SENSOR, BODY, POSE, POSE), TypeError, "parameter 'wrench'"),
-    (lambda: sense(SENSOR, BODY, POSE, "heavy"), TypeError, "parameter 'wrench'"),
-    (lambda: sense(SENSOR, "mug.obj", POSE), TypeError, "parameter 'body'"),
     (lambda: sense(SENSOR, [BODY, BODY], POSE), TypeError, r"body is a list: .* objects\.stack and jax\.vmap"),
     (lambda: sense(SENSOR, objects.stack([BODY, BODY]), POSE), ValueError, r"\(v, 3\): use jax\.vmap for"),
     (lambda: sense(SENSOR, too_many_faces(), POSE), ValueError, "131,073 faces, but at most 131,072 .*faces=131072"),
-    (lambda: sense("sensor.json", BODY, POSE), TypeError, "parameter 'sensor'"),
-    (lambda: touch(None, IMPRINT), TypeError, "parameter 'sensor'"),
-    (lambda: touch(SENSOR, np.ones((4, 5), np.uint8)), TypeError, "parameter 'imprint'"),
     (lambda: touch(SENSOR, jnp.zeros((4, 5, 3))), TypeError, "parameter 'imprint'"),
-    (lambda: touch(SENSOR, "imprint.png"), TypeError, "parameter 'imprint'"),
-    (lambda: touch(SENSOR, IMPRINT, jnp.zeros(3)), TypeError, "parameter 'window'"),
-    (
-        lambda: touch(SENSOR, IMPRINT, jnp.array([0, 0, 0, 0.1])),
-        ValueError,
-        "window must be finite left, top, width > 0",
-    ),
     (lambda: touch(SENSOR, IMPRINT, jnp.array([np.nan, 0, 0.1, 0.1])), ValueError, "window must be finite"),
-    (lambda: expose(None, frame_of((4, 4)), 0.5), TypeError, "parameter 'sensor'"),
-    (lambda: expose(SENSOR, jnp.zeros((4, 4, 3)), 0.5), TypeError, "parameter 'frame'"),
     (lambda: expose(SENSOR, frame_of((4, 4)), jnp.array([0.0, 0.5])), TypeError, "parameter 'light'"),
     (
         lambda: expose(SENSOR, frame_of((4, 4)), -0.1),
         ValueError,
         r"light is -0\.1, .*from 0 \(visual\) to 1 \(tactile\)",
     ),
-    (lambda: expose(SENSOR, frame_of((4, 4)), np.nan), ValueError, "light is nan"),
-    *(
-        (
-            lambda name=name: sense(
-                SENSOR, dataclasses.replace(BODY, **{name: getattr(BODY, name).at[7, 1].set(jnp.nan)}), POSE
-            ),
-            ValueError,
-            rf"{name} has values that are not finite \(\d of .*repair the mesh",
-        )
-        for name in ("vertices", "normals", "colors")
+    (
+        lambda: sense(SENSOR, dataclasses.replace(BODY, normals=BODY.normals.at[7, 1].set(jnp.nan)), POSE),
+        ValueError,
+        r"normals has values that are not finite \(\d of .*repair the mesh",
     ),
 ]
 
@@ -184,16 +160,10 @@ def test_an_invalid_traced_constant_gives_finite_images_of_the_empty_sensor(ligh
     assert refused > 3 * len(leaves)  # three of the six values are not finite
 
 
-@pytest.mark.slow
-def test_steep_falloff_of_leds_gives_finite_images():
-    steep = dataclasses.replace(SENSOR, lights=tactile.Leds(falloff=50.0))
-    imprint = jnp.zeros((60, 80)).at[3:14, 1:20].set(5e-4)
-    assert np.all(np.isfinite(touch(steep, imprint)))
-    assert np.all(np.isfinite(jax.jit(touch)(steep, imprint)))
-
-
-@pytest.mark.parametrize("bad", [(0, 0, 0, 0.1), (0, 0, 0.1, -0.1), (np.nan, 0, 0.1, 0.1), (0, 0, np.inf, 0.1)])
-def test_an_invalid_traced_window_shows_flat_skin(bad):
+def test_an_invalid_traced_window_shows_flat_skin_and_steep_leds_give_finite_images():
     imprint = jnp.zeros((24, 32)).at[8:14, 10:20].set(5e-4)
-    shown = jax.jit(touch)(SENSOR, imprint, jnp.array(bad, jnp.float32))
-    np.testing.assert_allclose(shown, touch(SENSOR, 0 * imprint), atol=1e-6)
+    shown, flat = jax.jit(touch), touch(SENSOR, 0 * imprint)
+    for bad in ((0, 0, 0, 0.1), (0, 0, 0.1, -0.1), (np.nan, 0, 0.1, 0.1), (0, 0, np.inf, 0.1)):
+        np.testing.assert_allclose(shown(SENSOR, imprint, jnp.array(bad, jnp.float32)), flat, atol=1e-6)
+    steep = dataclasses.replace(SENSOR, lights=tactile.Leds(falloff=50.0))
+    assert np.all(np.isfinite(shown(steep, imprint)))

@@ -18,10 +18,6 @@ from sts_jax import objects, sense
 SENSOR = sts.Sensor()
 
 
-def with_room(**changes):
-    return dataclasses.replace(SENSOR, room=dataclasses.replace(SENSOR.room, **changes))
-
-
 @pytest.mark.parametrize("resolution", [(64, 64), pytest.param((97, 53), marks=pytest.mark.slow)])
 def test_an_object_on_the_pad_darkens_the_skin_around_it(resolution):
     body = from_trimesh(trimesh.creation.cylinder(radius=0.015, height=0.06))
@@ -46,10 +42,7 @@ def test_the_view_is_independent_of_the_gels_limits():
     body = objects.make(jax.random.key(0), "camera")
     pose = jnp.array([0.0, 0, 0.06, 0.9, 0.3, 0.2, 0.2], jnp.float32)
     stiff = dataclasses.replace(SENSOR, gel=dataclasses.replace(SENSOR.gel, max_tilt=0.01, max_depth=0.0001))
-    for sensor in (SENSOR, stiff):
-        frame = sense(sensor, body, pose)
-        assert bool(frame.segmentation.any())
-        np.testing.assert_array_equal(frame.visual, sense(SENSOR, body, pose).visual)
+    np.testing.assert_array_equal(sense(stiff, body, pose).visual, sense(SENSOR, body, pose).visual)
 
 
 @pytest.mark.slow
@@ -76,7 +69,9 @@ def test_the_texture_of_a_public_mesh_agrees_with_traced_rays():
     raw = trimesh.load_scene(meshes / "potion.obj", process=False).to_geometry()
     sheet = np.asarray(Image.open(meshes / "potion.png").convert("RGB")) / 255
     # Albedo alone.
-    bare = with_room(milk=0.0, crease=0.0, haze=1e6, tint=jnp.ones(3), ambient=jnp.ones(3), colors=jnp.zeros((3, 3)))
+    flat = {"milk": 0.0, "crease": 0.0, "haze": 1e6, "tint": jnp.ones(3)}
+    room = dataclasses.replace(SENSOR.room, ambient=jnp.ones(3), colors=jnp.zeros((3, 3)), **flat)
+    bare = dataclasses.replace(SENSOR, room=room)
     turn = np.array([np.cos(0.6), np.sin(0.6), 0.0, 0.0])
     pose = jnp.asarray([0.0, 0.0, 0.05, *turn], jnp.float32)
     size = (240, 240)

@@ -96,18 +96,3 @@ def test_the_gradient_of_a_round_trip_through_a_matrix_is_the_identity(vector):
 
     got = jax.jacrev(round_trip)(jnp.array(vector))  # the round trip is the identity
     np.testing.assert_allclose(got, np.eye(3), atol=2e-3)
-
-
-@pytest.mark.parametrize(
-    ("name", "given", "parameter"),
-    [
-        ("pose_from_matrix", (jnp.eye(3),), "matrix"),
-        ("quat_from_rotvec", (jnp.zeros(4),), "v"),
-        ("quat_canonical", (jnp.ones(3),), "q"),
-        ("transform", (jnp.zeros((2, 7)), jnp.zeros(3)), "pose"),
-        ("pose_inverse", ("upright",), "pose"),
-    ],
-)
-def test_an_array_of_another_shape_raises_an_error(name, given, parameter):
-    with pytest.raises(TypeError, match=f"parameter '{parameter}'"):
-        getattr(geometry, name)(*given)

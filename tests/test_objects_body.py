@@ -9,19 +9,17 @@ import trimesh
 
 from sts_jax import objects
 from sts_jax.objects import fill_moments
-from sts_jax.objects.assembly import solid_moments, surface_moments
+from sts_jax.objects.assembly import corner_normals, solid_moments, surface_moments
 
 
-def brute(
-    body: objects.Body, solid: trimesh.Trimesh, fill: float, scale: float
-) -> tuple[float, np.ndarray, np.ndarray]:
+def brute(body: objects.Body, solid: trimesh.Trimesh, fill: float, scale: float, up: np.ndarray):
     """Mass, centre and inertia of samples: the shell's on the surface, the contents' lowest share of the volume."""
     rng = np.random.default_rng(0)
     shell = trimesh.sample.sample_surface(solid, 100_000, seed=2)[0]
     low, high = solid.bounds
     inside = rng.uniform(low, high, (300_000, 3))
     inside = inside[solid.contains(inside)]
-    inside = inside[np.argsort(inside[:, 2])][: int(len(inside) * fill)]
+    inside = inside[np.argsort(inside @ up)][: int(len(inside) * fill)]
     shell_mass = float(body.shell_mass) * scale
     contents_mass = float(body.contents_density) * solid.volume * fill
     weights = np.concatenate(
@@ -49,12 +47,13 @@ def jar(tmp_path_factory) -> tuple[objects.Body, trimesh.Trimesh]:
     return body, trimesh.Trimesh(np.asarray(body.vertices, float), faces, process=True)
 
 
-@pytest.mark.parametrize("scale", [0.9, 1.1])
-@pytest.mark.parametrize("fill", [0.0, 0.13, 0.5, 0.87, 1.0])
-def test_mass_properties_agree_with_samples(jar, fill, scale):
+@pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.3, -0.8, 0.5)])
+@pytest.mark.parametrize(("fill", "scale"), [(0.0, 1.1), (0.13, 0.9), (0.5, 1.1), (0.87, 0.9), (1.0, 1.1)])
+def test_mass_properties_agree_with_samples(jar, fill, scale, up):
     body, solid = jar
-    mass, com, inertia = jax.jit(objects.rigid)(body, fill, scale)
-    true_mass, true_com, true_inertia = brute(body, solid, fill, scale)
+    up = np.array(up) / np.linalg.norm(up)
+    mass, com, inertia = jax.jit(objects.rigid)(body, fill, scale, jnp.asarray(up, jnp.float32))
+    true_mass, true_com, true_inertia = brute(body, solid, fill, scale, up)
     np.testing.assert_allclose(mass, true_mass, rtol=1e-4)
     np.testing.assert_allclose(com, true_com, atol=2e-4)
     np.testing.assert_allclose(inertia, true_inertia, atol=0.015 * np.trace(true_inertia))
@@ -65,12 +64,9 @@ def test_repr_describes_a_body_in_one_line_also_while_traced(jar):
     size = " x ".join(f"{1e3 * side:.0f}" for side in solid.extents)
     held = rf"holds \S+ kg in {1e6 * solid.volume:.3g} ml"
     assert re.fullmatch(rf"Body\(mesh, {size} mm, \S+ kg, {held}, 480 faces, hull of \d+ points\)", repr(body))
-    made = objects.make(jax.random.key(0), "fork")
-    assert repr(made).startswith("Body(fork, ")
-    assert "solid" in repr(made)
-    assert repr(objects.stack([made, made])).startswith("Body(bodies of shape (2,), 1024 faces")
+    assert repr(objects.stack([body, body])).startswith("Body(bodies of shape (2,), 1024 faces")
     seen = []
-    jax.jit(lambda body: seen.append(repr(body)))(made)
+    jax.jit(lambda body: seen.append(repr(body)))(body)
     assert "vertices=float32[1024, 3]" in seen[0]
 
 
@@ -81,7 +77,6 @@ def test_repr_describes_a_body_in_one_line_also_while_traced(jar):
         ({"shell_mass": np.inf}, "shell_mass is inf, but all values must be finite"),
         ({"faces": 1024}, "faces has indices from 1024 to 1024, but with 1024 vertices"),
         ({"category": 8}, r"category is 8, but it must be -1 .* or an index into objects.CATEGORIES \(0 to 7\)"),
-        ({"category": -2}, "category is -2"),
     ],
 )
 def test_check_refuses_an_invalid_body_and_names_the_field(changes, message):
@@ -94,13 +89,6 @@ def test_check_refuses_an_invalid_body_and_names_the_field(changes, message):
         ValueError, match=r"vertices has the shape \(2, 1024, 3\), but it must be \(v, 3\): use jax.vmap for"
     ):
         objects.stack([body, body]).check()
-
-
-def test_a_solid_body_weighs_the_same_at_any_fill():
-    body = objects.make(jax.random.key(2), "fork")
-    empty, full = objects.rigid(body, 0.0, 1.0), objects.rigid(body, 1.0, 1.0)
-    for a, b in zip(empty, full, strict=True):
-        np.testing.assert_array_equal(a, b)
 
 
 def test_the_gradient_of_rigid_is_finite_and_equals_finite_differences():
@@ -146,25 +134,6 @@ def test_a_mirrored_body_is_that_of_the_mirrored_mesh(jar, tmp_path):
         np.testing.assert_array_equal(a, b)
 
 
-FILLS = np.linspace(0, 1, 33)
-_TABLE = jax.jit(jax.vmap(fill_moments, in_axes=(None, 0, None)))
-
-
-def filled(mesh: trimesh.Trimesh, up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> np.ndarray:
-    """Moments [1, x, y, z, xx, yy, zz, xy, xz, yz] about the origin at each of FILLS."""
-    found = _TABLE(jnp.asarray(mesh.triangles, jnp.float32), FILLS, jnp.asarray(up) / np.linalg.norm(up))
-    volume, centre, second = (np.asarray(x, float) for x in found)
-    full = second + volume[:, None, None] * centre[:, :, None] * centre[:, None]
-    return np.c_[volume, volume[:, None] * centre, full[:, [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]]
-
-
-def box_moments(a: float, b: float, c: float, centre: tuple[float, float, float]) -> np.ndarray:
-    """Moments of a solid box, by hand."""
-    x, y, z = centre
-    squares = [a * a / 12 + x * x, b * b / 12 + y * y, c * c / 12 + z * z]
-    return a * b * c * np.array([1, x, y, z, *squares, x * y, x * z, y * z])
-
-
 def twisted() -> trimesh.Trimesh:
     """Closed, not convex, in no special attitude and away from the origin."""
     mesh = trimesh.creation.torus(0.03, 0.012, major_sections=24, minor_sections=10)
@@ -177,43 +146,24 @@ def twisted() -> trimesh.Trimesh:
 def test_fills_of_a_box_are_the_closed_form():
     mesh = trimesh.creation.box((0.06, 0.04, 0.1))
     mesh.apply_translation([0.01, 0.02, 0.03])
-    table = filled(mesh)
-    truth = [box_moments(0.06, 0.04, 0.1 * s, (0.01, 0.02, -0.02 + 0.05 * s)) for s in FILLS]
-    np.testing.assert_allclose(table, truth, rtol=1e-5, atol=1e-12)
+    interior = jnp.asarray(mesh.triangles, jnp.float32)
+    for fill in np.linspace(0, 1, 9):
+        volume, centre, second = fill_moments(interior, fill)
+        np.testing.assert_allclose(volume, 0.06 * 0.04 * 0.1 * fill, rtol=1e-5, atol=1e-12)
+        if fill:
+            np.testing.assert_allclose(centre, [0.01, 0.02, -0.02 + 0.05 * fill], atol=1e-6)
+        squares = np.array([0.06, 0.04, 0.1 * fill]) ** 2 / 12
+        np.testing.assert_allclose(second, float(volume) * np.diag(squares), rtol=1e-4, atol=1e-12)
+    assert fill_moments(jnp.zeros((8, 3, 3)), 1.0)[0] == 0
 
 
-@pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (0.0, 0.0, -2.0), (0.3, -0.8, 0.5)])
-def test_fills_of_a_ring_agree_with_samples(direction):
-    mesh = twisted()
-    up = np.array(direction) / np.linalg.norm(direction)
-    table = filled(mesh, direction)
-    rng = np.random.default_rng(0)
-    low, high = mesh.bounds
-    points = rng.uniform(low, high, (200_000, 3))
-    points = points[mesh.contains(points)]
-    points = points[np.argsort(points @ up)]
-    for k in (1, 8, 20, 32):
-        part = points[: len(points) * k // 32]
-        np.testing.assert_allclose(table[k, 0], mesh.volume * k / 32, rtol=1e-5)
-        noise = 5 / np.sqrt(len(part))
-        centre = table[k, 1:4] / table[k, 0]
-        assert (abs(centre - part.mean(0)) < noise * part.std(0)).all()
-        i, j = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
-        square = part[:, i] * part[:, j]
-        assert (abs(table[k, 4:] / table[k, 0] - square.mean(0)) < noise * square.std(0)).all()
-
-
-def test_whole_solid_agrees_with_trimesh():
+def test_moments_of_a_solid_and_of_a_surface_agree_with_trimesh():
     mesh = twisted()
     total = solid_moments(mesh.triangles).sum(0)
     np.testing.assert_allclose(total[0], mesh.volume)
     np.testing.assert_allclose(total[1:4] / total[0], mesh.center_mass)
     central = total[4:7] - total[0] * (total[1:4] / total[0]) ** 2
     np.testing.assert_allclose(central.sum() - central, np.diag(mesh.moment_inertia), rtol=1e-6)
-
-
-def test_surface_moments_agree_with_samples():
-    mesh = twisted()
     total = surface_moments(mesh.triangles).sum(0)
     points = trimesh.sample.sample_surface(mesh, 200_000, seed=1)[0]
     np.testing.assert_allclose(total[0], mesh.area)
@@ -221,9 +171,12 @@ def test_surface_moments_agree_with_samples():
     np.testing.assert_allclose(total[4:7] / total[0], (points**2).mean(0), atol=3e-5)
 
 
-def test_an_empty_and_a_missing_interior_weigh_nothing():
-    for triangles in (trimesh.creation.box((0.1, 0.1, 0.1)).triangles, np.zeros((8, 3, 3))):
-        volume, centre, second = fill_moments(jnp.asarray(triangles, jnp.float32), 0.0)
-        assert volume == 0
-        np.testing.assert_array_equal(second, 0)
-        np.testing.assert_allclose(centre, 0, atol=1e-7)
+def test_corner_normals_are_smooth_on_a_ball_sharp_on_a_box_and_finite_without_area():
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=1.0)
+    np.testing.assert_allclose(corner_normals(ball.vertices, ball.faces), ball.vertices[ball.faces], atol=2e-2)
+    cube = trimesh.creation.box((1.0, 1.0, 1.0))
+    normals = corner_normals(cube.vertices, cube.faces)
+    np.testing.assert_allclose(normals, np.repeat(cube.face_normals[:, None], 3, axis=1), atol=1e-12)
+    vertices = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 1, 0]])
+    normals = corner_normals(vertices, np.array([[0, 1, 2], [0, 1, 3]]))
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1)

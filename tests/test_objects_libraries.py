@@ -4,9 +4,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapenet_folder as shapenet
-from object_files import BAD_FILES, box, mixed_folder, same_points, surface
+from object_files import BAD_FILES, box, leaves, mixed_folder, same_points, surface
 
 from sts_jax import objects
+from sts_jax.objects import libraries
 
 
 @pytest.fixture
@@ -39,24 +40,13 @@ def test_files_of_any_folder_take_the_axes_of_their_format_and_the_given_size(fo
         np.testing.assert_allclose(np.ptp(np.asarray(body.vertices), axis=0).max(), size, rtol=1e-5)
 
 
-def test_a_missing_and_an_empty_folder_are_refused(tmp_path):
+def test_a_missing_and_an_empty_folder_and_a_bad_argument_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match="nowhere: no such folder"):
         objects.library(tmp_path / "nowhere")
     with pytest.raises(ValueError, match=f"{tmp_path.name}: the folder contains no usable mesh"):
         objects.library(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"scale": 1.0, "longest_side": 0.1}, "not both"),
-        ({"largest": 0.001}, r"largest is 0\.001 m, but it must be from 0\.005 to 0\.15 m"),
-        ({"faces": 3}, "faces must be a whole number >= 4"),
-    ],
-)
-def test_arguments_out_of_range_are_refused(folder, arguments, message):
-    with pytest.raises(ValueError, match=message):
-        objects.library(folder, **arguments)
+    with pytest.raises(ValueError, match="not both"):
+        objects.library(tmp_path, scale=1.0, longest_side=0.1)
 
 
 def test_bad_objects_are_left_out_and_named(tmp_path):
@@ -87,8 +77,44 @@ def test_bad_objects_are_left_out_and_named(tmp_path):
     assert objects.survey(listed) == (usable, text)
 
 
-def test_a_deleted_file_is_left_out_and_named(folder):
-    listed = objects.library(folder, cache=folder / "cache")
+def test_the_cache_returns_the_same_bytes_without_loading_again(folder, tmp_path, monkeypatch):
+    plain = [leaves(body) for body in objects.bodies(objects.library(folder))[0]]
+    listed = objects.library(folder, cache=tmp_path / "kept")
+    usable, text = objects.survey(listed)
+    assert len(list((tmp_path / "kept").iterdir())) == len(listed.items)
+    monkeypatch.setattr(libraries, "load", None)  # nothing is made twice
+    assert [leaves(body) for body in objects.bodies(usable)[0]] == plain
+    assert objects.survey(listed) == (usable, text)
     (folder / "loose.obj").unlink()
     reason = "no such mesh file: restore it, or call objects.library() again to list the existing files"
     assert objects.bodies(listed, [3]) == ([], [("loose.obj", reason)])
+
+
+def test_a_torn_file_of_the_cache_is_replaced(folder, tmp_path):
+    listed = objects.library(folder, cache=tmp_path / "kept")
+    whole = leaves(objects.read(listed, 1).body)
+    (place,) = (tmp_path / "kept").iterdir()
+    content = place.read_bytes()
+    for torn in (content[: len(content) // 2], b"", b"\x80 no archive", content[:-200] + bytes(200)):
+        place.write_bytes(torn)
+        assert leaves(objects.read(listed, 1).body) == whole
+        assert place.read_bytes() == content
+    assert list((tmp_path / "kept").iterdir()) == [place]
+
+
+def test_a_changed_file_image_or_setting_is_another_entry_of_the_cache(tmp_path):
+    shapenet.build(tmp_path, [shapenet.row("a", "Watch")], {"a": box((2, 1, 1))}, {"a": (9, 9, 9)})
+    cache = tmp_path / "kept"
+
+    def count(**settings) -> int:
+        objects.read(objects.library(tmp_path, cache=cache, **settings), 0)
+        return len(list(cache.iterdir()))
+
+    assert [count(), count()] == [1, 1]
+    image = tmp_path / "models-textures" / "textures" / "a.png"
+    image.write_bytes(image.read_bytes() + b"\0")
+    assert count() == 2
+    mesh = tmp_path / "models-OBJ" / "models" / "a.obj"
+    mesh.write_text(mesh.read_text() + "# end\n")
+    assert count() == 3
+    assert [count(longest_side=0.05), count(faces=64), count(largest=0.06)] == [4, 5, 6]

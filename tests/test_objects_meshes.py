@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 import trimesh
 from object_files import BAD_FILES, surface, volume
-from optics_bodies import public_meshes
 from PIL import Image
 
 from sts_jax import objects
@@ -22,10 +21,6 @@ def looked_up(body: objects.Body) -> np.ndarray:
     return texture[row, column] * np.asarray(body.colors)[:number]
 
 
-def corners(body: objects.Body) -> np.ndarray:
-    return surface(body).triangles
-
-
 @pytest.fixture
 def box(tmp_path) -> Path:
     path = tmp_path / "box.stl"
@@ -33,7 +28,7 @@ def box(tmp_path) -> Path:
     return path
 
 
-def flag(folder: Path, *, material: bool = True, image: bool = True) -> Path:
+def flag(folder: Path, *, material: bool = True) -> Path:
     """A box as an OBJ whose front (y low) wears an image, red above blue, and whose Kd is dark."""
     mesh = trimesh.creation.box((0.1, 0.06, 0.04))
     lines = ["mtllib flag.mtl", "usemtl cloth"]
@@ -43,15 +38,19 @@ def flag(folder: Path, *, material: bool = True, image: bool = True) -> Path:
     (folder / "flag.obj").write_text("\n".join(lines) + "\n")
     if material:
         (folder / "flag.mtl").write_text("newmtl cloth\nKd 0.1 0.1 0.1\nmap_Kd flag.png\n")
-    if image:
-        pixels = np.zeros((40, 60, 3), np.uint8)
-        pixels[:20], pixels[20:] = (200, 0, 0), (0, 0, 200)
-        Image.fromarray(pixels).save(folder / "flag.png")
+    pixels = np.zeros((40, 60, 3), np.uint8)
+    pixels[:20], pixels[20:] = (200, 0, 0), (0, 0, 200)
+    Image.fromarray(pixels).save(folder / "flag.png")
     return folder / "flag.obj"
 
 
-def test_a_closed_box_has_the_mass_and_volume_of_its_dimensions(box):
-    body = objects.load(box)
+@pytest.mark.parametrize("inside_out", [False, True])
+def test_a_closed_box_has_the_mass_and_volume_of_its_dimensions(tmp_path, inside_out):
+    mesh = trimesh.creation.box((0.1, 0.06, 0.04))
+    if inside_out:
+        mesh.invert()
+    mesh.export(tmp_path / "box.stl")
+    body = objects.load(tmp_path / "box.stl")
     area = 2 * (0.1 * 0.06 + 0.1 * 0.04 + 0.06 * 0.04)
     np.testing.assert_allclose(body.shell_mass, 1.2 * area, rtol=1e-5)
     np.testing.assert_allclose(volume(body), 0.1 * 0.06 * 0.04, rtol=1e-5)
@@ -60,8 +59,13 @@ def test_a_closed_box_has_the_mass_and_volume_of_its_dimensions(box):
     assert int(body.category) == -1
     assert body.hulls.shape == (1, 32, 3)
     assert len(np.unique(np.asarray(body.hulls)[0], axis=0)) == 8
-    np.testing.assert_allclose(corners(body).max((0, 1)), [0.05, 0.03, 0.02], rtol=1e-5)
+    corners = surface(body).triangles
+    np.testing.assert_allclose(corners.max((0, 1)), [0.05, 0.03, 0.02], rtol=1e-5)
+    assert (np.einsum("fki,fki->fk", np.asarray(body.normals)[:12], corners) > 0).all()
     np.testing.assert_allclose(np.asarray(body.colors)[:12], linear(np.array(0.7)), rtol=1e-5)
+    body = objects.load(tmp_path / "box.stl", mass=0.3)  # no contents
+    for fill in (0.0, 1.0):
+        np.testing.assert_allclose(objects.rigid(body, fill, 1.0)[0], 0.3, rtol=1e-6)
 
 
 def test_parts_that_share_an_edge_are_closed(tmp_path):
@@ -85,12 +89,6 @@ def test_parts_that_share_an_edge_are_closed(tmp_path):
         assert objects.load(path, mass=0.1).two_sided
 
 
-def test_a_body_with_a_given_mass_has_no_contents(box):
-    body = objects.load(box, mass=0.3)
-    for fill in (0.0, 1.0):
-        np.testing.assert_allclose(objects.rigid(body, fill, 1.0)[0], 0.3, rtol=1e-6)
-
-
 @pytest.mark.parametrize("up", ["x", "y", "z"])
 def test_up_is_a_rotation(tmp_path, up):
     mesh = trimesh.creation.box((0.02, 0.03, 0.04))
@@ -101,8 +99,7 @@ def test_up_is_a_rotation(tmp_path, up):
     np.testing.assert_allclose(np.ptp(np.asarray(body.vertices), axis=0).max(), 0.05, rtol=1e-5)
     vertices = np.asarray(body.vertices)
     high, low = vertices[np.argmax(vertices[:, 2])], vertices[np.argmin(vertices[:, 2])]
-    assert abs(high[0]) < 1e-6
-    assert abs(high[1]) < 1e-6
+    assert abs(high[:2]).max() < 1e-6
     assert high[2] > -low[2]
     assert volume(body) > 0  # not turned inside out
 
@@ -111,13 +108,13 @@ def test_obj_texture_the_right_way_up(tmp_path):
     body = objects.load(flag(tmp_path))
     assert body.texture.shape == (256, 256, 3)
     color = looked_up(body)
-    high = corners(body)[..., 2] > 0
+    high = surface(body).triangles[..., 2] > 0
     level = linear(np.array(200 / 255))
     np.testing.assert_allclose(color[high], np.broadcast_to([level, 0, 0], color[high].shape), atol=1e-3)
     np.testing.assert_allclose(color[~high], np.broadcast_to([0, 0, level], color[~high].shape), atol=1e-3)
 
 
-def test_a_missing_material_is_named_once_and_texture_replaces_it(tmp_path):
+def test_missing_materials_and_images_are_named_and_texture_replaces_them(tmp_path):
     path = flag(tmp_path, material=False)
     with pytest.warns(UserWarning, match=r"flag\.mtl.*argument texture") as caught:
         objects.load(path)
@@ -126,15 +123,13 @@ def test_a_missing_material_is_named_once_and_texture_replaces_it(tmp_path):
         objects.load(path, strict=True)
     body = objects.load(path, texture=tmp_path / "flag.png")
     assert body.texture.shape == (256, 256, 3)
-    assert looked_up(body)[corners(body)[..., 2] > 0][:, 0].min() > 0.5
-
-
-def test_missing_and_torn_images_are_named(tmp_path):
-    path = flag(tmp_path, image=False)
-    with pytest.warns(UserWarning, match=r"flag\.png"):
-        objects.load(path)
+    assert looked_up(body)[surface(body).triangles[..., 2] > 0][:, 0].min() > 0.5
+    path = flag(tmp_path)
     (tmp_path / "flag.png").write_bytes(b"\x89PNG\r\n\x1a\n torn")
     with pytest.raises(ValueError, match=r"flag\.png: the file cannot be read as an image"):
+        objects.load(path)
+    (tmp_path / "flag.png").unlink()
+    with pytest.warns(UserWarning, match=r"flag\.png"):
         objects.load(path)
     with pytest.raises(FileNotFoundError, match=r"none\.png"):
         objects.load(path, texture=tmp_path / "none.png")
@@ -146,7 +141,7 @@ def test_vertex_and_face_colours(tmp_path):
     mesh.visual.vertex_colors = paint
     mesh.export(tmp_path / "vertex.ply")
     body = objects.load(tmp_path / "vertex.ply")
-    color, high = looked_up(body), corners(body)[..., 2] > 0
+    color, high = looked_up(body), surface(body).triangles[..., 2] > 0
     np.testing.assert_allclose(color[high], np.broadcast_to([1.0, 0, 0], color[high].shape), atol=1e-6)
     green = [0, float(linear(np.array(100 / 255))), 0]
     np.testing.assert_allclose(color[~high], np.broadcast_to(green, color[~high].shape), atol=1e-6)
@@ -168,7 +163,7 @@ def test_gltf_factor_is_linear_and_scenes_are_merged(tmp_path):
     scene.export(tmp_path / "two.glb")
     body = objects.load(tmp_path / "two.glb")
     assert len(surface(body).faces) == 24
-    color, high = looked_up(body), corners(body)[..., 2] > 0
+    color, high = looked_up(body), surface(body).triangles[..., 2] > 0
     np.testing.assert_allclose(color[high][:, :2], np.broadcast_to([0, 64 / 255], (36, 2)), atol=1e-3)
     np.testing.assert_allclose(color[~high][:, :2], np.broadcast_to([128 / 255, 0], (36, 2)), atol=1e-3)
     np.testing.assert_allclose(np.ptp(np.asarray(body.vertices), axis=0), [0.02, 0.02, 0.07], rtol=1e-5)
@@ -186,7 +181,7 @@ def test_several_textures_become_one(tmp_path):
     scene.export(tmp_path / "three.glb")
     body = objects.load(tmp_path / "three.glb")
     assert body.texture.shape == (1024, 1024, 3)
-    color, z = looked_up(body), corners(body)[..., 2]
+    color, z = looked_up(body), surface(body).triangles[..., 2]
     for rows, truth in ((z < -0.02, [1, 0, 0]), (abs(z) < 0.02, [0, 1, 0]), (z > 0.02, [1, 1, 1])):
         np.testing.assert_allclose(color[rows], np.broadcast_to(truth, color[rows].shape), atol=2e-2)
 
@@ -209,39 +204,24 @@ def test_an_open_bowl_takes_the_volume_of_its_hull_with_one_warning(tmp_path):
         assert objects.load(path, mass=0.1).two_sided  # needs no volume
 
 
-def test_inside_out_mesh_is_turned(tmp_path):
-    mesh = trimesh.creation.box((0.1, 0.06, 0.04))
-    mesh.invert()
-    mesh.export(tmp_path / "inverted.stl")
-    body = objects.load(tmp_path / "inverted.stl")
-    np.testing.assert_allclose(volume(body), 0.1 * 0.06 * 0.04, rtol=1e-5)
-    outward = np.einsum("fki,fki->fk", np.asarray(body.normals)[:12], corners(body))
-    assert (outward > 0).all()
-
-
 def test_normals_of_a_ball_are_smooth_and_its_hull_has_64_vertices(tmp_path):
     trimesh.creation.icosphere(subdivisions=3, radius=0.04).export(tmp_path / "ball.stl")
     body = objects.load(tmp_path / "ball.stl")
     assert body.hulls.shape == (1, 64, 3)
     assert 1e-3 < objects.gaps(body)[0] < 3e-3
-    np.testing.assert_allclose(np.asarray(body.normals)[:1280], corners(body) / 0.04, atol=0.05)
+    np.testing.assert_allclose(np.asarray(body.normals)[:1280], surface(body).triangles / 0.04, atol=0.05)
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ({"mass": -0.1}, "mass must be a positive number of kilograms"),
-        ({"mass": float("nan")}, "mass must be a positive"),
-        ({"density": 0.0}, "density must be a positive"),
-        ({"scale": 0.0}, "scale must be a positive"),
-        ({"longest_side": -0.1}, "longest_side must be a positive"),
         ({"longest_side": 0.004}, r"longest_side is 0\.004 m, but it must be from 0\.005 to 0\.15 m"),
         ({"largest": 0.2}, r"largest is 0\.2 m, but it must be from 0\.005 to 0\.15 m"),
         ({"scale": 1.0, "longest_side": 0.1}, "not both"),
         ({"scale": 0.001}, r"longest side is 0\.1 mm, but it must be at least 5 mm: .*longest_side \(in metres\)"),
         ({"category": 99}, "category is 99, but it must be -1"),
         ({"faces": 2}, "faces must be a whole number >= 4"),
-        ({"faces": True}, "faces must be a whole number >= 4"),
         ({"up": (0.0, 0.0, 0.0)}, r"up not \(0, 0, 0\)"),
         ({"up": (0.0, 1.0, 0.0)}, "must not be parallel"),
         ({"up": "z", "front": (0.0, -1.0, 0.0)}, "give an axis x, y or z without front, or two directions"),
@@ -294,17 +274,3 @@ def test_too_many_faces_are_refused(tmp_path, monkeypatch):
     trimesh.creation.icosphere(subdivisions=4, radius=0.04).export(tmp_path / "fine.stl")
     with pytest.raises(ValueError, match=r"fine\.stl: the mesh has 5,120 faces, but at most 4,096.*decimate"):
         objects.load(tmp_path / "fine.stl")
-
-
-def test_a_public_textured_mesh_loads():
-    # miniworld's potion bottle (Farama Foundation): made by nobody here, and its OBJ names a material nobody has.
-    folder = public_meshes()
-    body = objects.load(folder / "potion.obj", longest_side=0.08, up="y", texture=folder / "potion.png", strict=True)
-    assert body.texture.shape == (256, 256, 3)
-    assert np.asarray(body.texture).std() > 0.05
-    assert len(np.unique(np.round(looked_up(body).reshape(-1, 3), 2), axis=0)) > 5
-    assert 10e-6 < volume(body) < 100e-6
-    vertices = np.asarray(body.vertices)
-    extent = np.ptp(vertices, axis=0)
-    np.testing.assert_allclose(extent.max(), 0.08, rtol=1e-5)
-    assert np.argmax(extent) == 2  # it stands

@@ -62,14 +62,6 @@ def test_parts_leave_the_cavity_free_and_the_hull_does_not(mesh, free, filled):
     assert with_parts[0] < 0.002
 
 
-def test_parts_are_the_same_every_time():
-    vertices, faces = np.asarray(corner_piece().vertices), np.asarray(corner_piece().faces)
-    parts, again = convex_parts(vertices, faces), convex_parts(vertices, faces)
-    assert all(np.array_equal(one, other) for one, other in zip(parts, again, strict=True))
-    volumes = [trimesh.convex.convex_hull(part).volume for part in parts]
-    assert volumes == sorted(volumes, reverse=True)
-
-
 def test_gaps_of_known_shapes():
     mesh = trimesh.creation.box((0.06, 0.04, 0.02))
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
@@ -102,14 +94,7 @@ def test_the_gap_of_an_open_sheet_is_measured_on_both_sides():
         assert gaps == pytest.approx((0, 0.04), rel=0.05, abs=1e-9)  # the middle of the open side
 
 
-def test_the_error_names_the_missing_package(monkeypatch):
-    monkeypatch.setitem(sys.modules, "coacd", None)
-    mesh = corner_piece()
-    with pytest.raises(ImportError, match=r"coacd.*install -e '\.\[meshes\]'"):
-        convex_parts(np.asarray(mesh.vertices), np.asarray(mesh.faces))
-
-
-def test_decomposition_changes_only_the_hulls(tmp_path):
+def test_decomposition_changes_only_the_hulls_and_equal_meshes_have_equal_parts(tmp_path, monkeypatch):
     corner_piece().export(tmp_path / "corner.stl")
     whole, body = objects.load(tmp_path / "corner.stl"), objects.load(tmp_path / "corner.stl", parts=True)
     assert body.hulls.shape == (objects.PART_CLASSES[1], objects.HULL_CLASSES[0], 3)
@@ -117,8 +102,12 @@ def test_decomposition_changes_only_the_hulls(tmp_path):
     np.testing.assert_array_equal(body.hulls[2:], np.broadcast_to(body.hulls[1], body.hulls[2:].shape))
     for name in ("vertices", "faces", "colors", "shell_mass", "shell_inertia", "interior", "category"):
         np.testing.assert_array_equal(getattr(body, name), getattr(whole, name))
+    np.testing.assert_array_equal(objects.decompose(whole).hulls, body.hulls)
     assert objects.gaps(whole)[1] == pytest.approx(0.0343, abs=5e-4)
     assert max(objects.gaps(body)) < 0.002
+    monkeypatch.setitem(sys.modules, "coacd", None)
+    with pytest.raises(ImportError, match=r"coacd.*install -e '\.\[meshes\]'"):
+        objects.decompose(whole)
 
 
 def test_a_library_decomposes_where_the_hull_is_wrong(tmp_path):

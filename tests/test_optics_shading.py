@@ -12,8 +12,6 @@ from sts_jax import optics
 pytestmark = pytest.mark.usefixtures("strict_ranks")
 
 PAD = (0.15, 0.15)  # m
-CELLS = (150, 150)
-SHAPES = [(64, 64), (97, 53), (200, 200), (1232, 1640)]
 
 
 def test_srgb_conversion_equals_the_standard():
@@ -37,22 +35,15 @@ def test_texture_is_bilinear_with_its_first_row_at_v_zero():
     np.testing.assert_array_equal(plain, np.full((7, 3), 0.5))
 
 
-def samples(shape, seed=0):
-    """Random albedo, normals, heights, empty view and hidden sky."""
-    rng = np.random.default_rng(seed)
+def test_shading_equals_lamberts_law_behind_a_milky_skin():
+    room, shape = optics.Room(), (97, 53)
+    rng = np.random.default_rng(0)
     albedo, empty = rng.uniform(size=(2, *shape, 3))
     normals = rng.normal(size=(*shape, 3))
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    return albedo, normals, rng.uniform(-0.002, 0.2, shape), empty, rng.uniform(size=shape)
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_shading_equals_lamberts_law_behind_a_milky_skin(shape):
-    room = optics.Room()
-    albedo, normals, heights, empty, hidden = samples(shape)
+    heights, hidden = rng.uniform(-0.002, 0.2, shape), rng.uniform(size=shape)
     arrays = [jnp.asarray(a, jnp.float32) for a in (albedo, normals, heights, empty, hidden)]
     got = np.asarray(jax.jit(optics.shade)(room, *arrays))
-    rng = np.random.default_rng(1)
     for i, j in zip(rng.integers(shape[0], size=100), rng.integers(shape[1], size=100), strict=True):
         light = np.array(room.ambient, float)
         for direction, color in zip(np.asarray(room.directions, float), np.asarray(room.colors), strict=True):
@@ -66,9 +57,8 @@ def test_shading_equals_lamberts_law_behind_a_milky_skin(shape):
         np.testing.assert_allclose(got[i, j], expected, atol=1e-5)
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-def test_the_empty_view_has_the_papers_colour_with_vignette_walls_and_shadow(shape):
-    room = optics.Room()
+def test_the_empty_view_has_the_papers_colour_with_vignette_walls_and_shadow():
+    room, shape = optics.Room(), (97, 53)
     rng = np.random.default_rng(0)
     radius, walls, hidden = rng.uniform(0, 2.8, shape), rng.uniform(size=shape), rng.uniform(size=shape)
     image = np.asarray(jax.jit(optics.empty_view)(room, *map(jnp.float32, (radius, walls, hidden))))
@@ -98,36 +88,8 @@ def centres(cells):
     return ((np.arange(cells) + 0.5) / cells - 0.5) * 0.15
 
 
-def box_heights(low, half_x, half_y, cells=CELLS):
-    x, y = np.meshgrid(centres(cells[1]), centres(cells[0]))
-    return np.where((abs(x) < half_x) & (abs(y) < half_y), low, np.inf)
-
-
 def hidden_by(heights, top, x, y):
     return np.asarray(jax.jit(optics.hidden_sky)(*map(jnp.float32, (heights,)), PAD, *map(jnp.float32, (top, x, y))))
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "half_x", "half_y"),
-    [
-        (0.0, 0.06, 0.0125, 0.0125),  # stands
-        (0.0, 0.02, 0.04, 0.015),  # lies
-        (0.0, 0.003, 0.03, 0.03),  # a plate
-        (0.02, 0.05, 0.03, 0.02),  # in the air
-        (0.06, 0.1, 0.05, 0.03),
-    ],
-)
-def test_hidden_sky_agrees_with_traced_rays(low, high, half_x, half_y):
-    mesh = trimesh.creation.box((2 * half_x, 2 * half_y, high - low))
-    mesh.apply_translation((0, 0, (low + high) / 2))
-    x, y = np.linspace(-0.07, 0.07, 29), np.linspace(-0.07, 0.07, 15)
-    got = hidden_by(box_heights(low, half_x, half_y), high, x, y)
-    truth = rays_hidden(mesh, [(a, b) for b in y for a in x]).reshape(15, 29)
-    # Beside an edge on the skin, the coarse grid softens the result.
-    assert np.abs(got - truth).mean() < 0.07
-    assert np.corrcoef(got.ravel(), truth.ravel())[0, 1] > 0.94
-    assert got.min() >= 0
-    assert got.max() <= 1 + 1e-6
 
 
 def test_hidden_sky_under_a_ball_agrees_with_traced_rays():
@@ -154,7 +116,7 @@ def test_hidden_sky_beside_a_straight_edge_equals_the_closed_form():
 
 
 def test_absent_and_distant_objects_hide_no_sky():
-    assert not np.any(hidden_by(np.full(CELLS, np.inf), 0.1, centres(30), centres(40)))
-    # Objects far above the skin or entirely below it hide nothing either.
-    assert hidden_by(box_heights(0.5, 0.03, 0.03), 0.6, centres(30), centres(40)).max() < 0.01
-    assert not np.any(hidden_by(box_heights(-0.1, 0.03, 0.03), -0.05, centres(30), centres(40)))
+    x, y = np.meshgrid(centres(150), centres(150))
+    for low, most in ((np.inf, 0), (-0.1, 0), (0.5, 0.01)):  # no object, below the skin, and far above it
+        heights = np.where((abs(x) < 0.03) & (abs(y) < 0.03), low, np.inf)
+        assert hidden_by(heights, low + 0.05, centres(30), centres(40)).max() <= most

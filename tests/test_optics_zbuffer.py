@@ -40,7 +40,6 @@ def bodies():
     yield "bumpy", from_trimesh(bumpy)
     yield "slivers", from_trimesh(slivers)
     yield "ring", from_trimesh(ring)
-    yield "box", from_trimesh(trimesh.creation.box((0.05, 0.02, 0.09)))
     meshes = public_meshes()
     yield "potion", objects.load(meshes / "potion.obj", longest_side=0.08, up="y", texture=meshes / "potion.png")
     for category in ("bottle", "fork", "watch"):
@@ -153,10 +152,8 @@ def test_two_sided_faces_are_visible_from_behind():
         assert bool(jnp.any(seen >= 0)) == two_sided
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["bumpy", "ring", "bottle"])
-def test_near_faces_have_an_image_of_their_own(name):
-    body = BODIES[name]
+def test_near_faces_have_an_image_of_their_own():
+    body = BODIES["ring"]
     points = geometry.transform(some_pose(np.random.default_rng(7)), body.vertices)
     faces, height = np.asarray(body.faces), np.asarray(points[:, 2])
     real = np.any(faces != faces[:, :1], axis=1)
@@ -174,15 +171,3 @@ def test_near_faces_have_an_image_of_their_own(name):
     assert np.any(np.asarray(both[0]) != np.asarray(both[1]))
     np.testing.assert_array_equal(both[0], alone(np.where(near[:, None], faces, faces[:, :1])))
     np.testing.assert_array_equal(both[1], alone(faces))
-
-
-def test_vmap_agrees_with_a_loop():
-    body = BODIES["ring"]
-    rng = np.random.default_rng(5)
-    poses = jnp.stack([some_pose(rng) for _ in range(3)])
-    batch = jax.jit(jax.vmap(lambda pose: draw(body.vertices, body.faces, body.two_sided, pose, (64, 64))[1]))(poses)
-    for pose, winner in zip(poses, batch, strict=True):
-        alone = drawn(body.vertices, body.faces, body.two_sided, pose, (64, 64))[1]
-        assert np.sum(np.asarray(alone) >= 0) > 40
-        # Two programs round differently on some machines, which can swap the two faces at a pixel on their edge.
-        assert np.sum(alone != winner) <= 4

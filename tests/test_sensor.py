@@ -57,43 +57,24 @@ def test_a_loaded_sensor_equals_the_saved_one(tmp_path, lights):
 LEDS_FILE = {"lights": {"kind": "Leds", "positions": [[0.1, 0, -0.002]], "colors": [[1, 1, 1]]}}
 # A field of a file, and an invalid value for it.
 INVALID = [
-    ("gel.stiffness", 0),
     ("gel.stiffness", "3"),
-    ("gel.stiffness", True),
     ("gel.size", [0.15]),
-    ("gel.cells", [0, 150]),
-    ("gel.cells", [0.5, 150]),
     ("gel.colour", 1),
     ("gel.max_depth", 0.006),
-    ("gel.max_tilt", 1.6),
     ("camera.distance", 0.003),
-    ("camera.near", 0.099),
-    ("camera", 3),
     ("camera", None),
     ("housing", {}),
-    ("lights", []),
     ("lights.kind", "Lamps"),
-    ("lights.kind", ["Leds"]),
     ("lights.positions", [[0.1, 0, -0.02]]),  # unknown to Lights
-    ("lights.directions", [[0, 1]]),
-    ("lights.directions", []),
     ("lights.directions", [[0, 0, float("nan")]]),
-    ("lights.directions", [[0, 0, -1.0]] * 3),
     ("lights.directions", [[0, 0, 0]] * 4),
-    ("lights.directions", [[0, 1, 0.1]] * 4),
-    ("lights.directions", [[0, 1, 0.1], [0, 1]]),
-    ("phong.ambient_color", [1, 1, 1, 1]),
-    ("skin.coupling", float("inf")),
     ("skin.shadow_steps", 2.5),
     ("room.directions", [[0, 0, 0], [1, 0, 0], [0, 0, 1]]),
-    ("room.colors", [[0, 0, 1]]),
 ]
 INVALID_LEDS = [
     ("lights.positions", [[0.0, 0, -0.004]]),  # in the gel, over the pad
     ("lights.positions", [[0.075, 0.075, 0.0]]),  # at its corner
     ("lights.positions", [[0.1, 0, 0.001]]),  # beside the pad, above the gel's face
-    ("lights.directions", [[0.0, 0, -1]]),  # unknown to Leds
-    ("lights.falloff", [2, 2]),
 ]
 
 
@@ -112,14 +93,14 @@ def test_an_invalid_or_unknown_field_in_a_file_raises_an_error_that_names_it(tmp
         Sensor.load(path)
 
 
-@pytest.mark.parametrize("fields", [["gel.thickness"], ["skin"], ["lights"], ["lights.kind"], ["phong", "fine_below"]])
-def test_a_missing_field_in_a_file_takes_its_default(tmp_path, fields):
-    path, values = tmp_path / "sensor.json", dataclasses.replace(Sensor(), gel=tactile.Gel(stiffness=5e5)).constants()
-    for field in fields:
-        *above, last = field.split(".")
-        del functools.reduce(dict.__getitem__, above, values)[last]
+@pytest.mark.parametrize("field", ["gel.thickness", "skin", "lights", "lights.kind", "fine_below"])
+def test_a_missing_field_in_a_file_takes_its_default(tmp_path, field):
+    sensor = Sensor(gel=tactile.Gel(stiffness=5e5))
+    path, values = tmp_path / "sensor.json", sensor.constants()
+    *above, last = field.split(".")
+    del functools.reduce(dict.__getitem__, above, values)[last]
     path.write_text(json.dumps(values))
-    assert Sensor.load(path).constants() == dataclasses.replace(Sensor(), gel=tactile.Gel(stiffness=5e5)).constants()
+    assert Sensor.load(path).constants() == sensor.constants()
 
 
 @pytest.mark.parametrize(
@@ -127,8 +108,6 @@ def test_a_missing_field_in_a_file_takes_its_default(tmp_path, fields):
     [
         ("lights.directions", [[-1.0, 0, 0]] * 4),
         ("gel.cells", (150.0, 150.0)),
-        ("gel.cells", [150, 150]),
-        ("gel.size", jnp.array([0.15, 0.15])),
         ("skin.shadow_steps", jnp.int32(4)),
     ],
 )
@@ -153,21 +132,17 @@ def with_field(sensor, field, value):
 
 
 def limited_fields():
-    for part in dataclasses.fields(Sensor(lights=tactile.Leds())):
-        for field in (
-            dataclasses.fields(getattr(Sensor(lights=tactile.Leds()), part.name)) if part.name != "fine_below" else ()
-        ):
-            for limit, sign, step in (
-                ("above", ">", 0),
-                ("at_least", ">=", -1),
-                ("below", "<", 1),
-                ("at_most", "<=", 1),
-            ):
-                if limit in field.metadata:
-                    yield part.name, field.name, field.metadata[limit] + step, sign
+    sensor = Sensor(lights=tactile.Leds())
+    parts = [part.name for part in dataclasses.fields(sensor) if part.name != "fine_below"]
+    beyond = {"above": (">", 0), "at_least": (">=", -1), "below": ("<", 1), "at_most": ("<=", 1)}
+    for part in parts:
+        for field in dataclasses.fields(getattr(sensor, part)):
+            for limit in beyond.keys() & field.metadata.keys():
+                sign, step = beyond[limit]
+                yield part, field.name, field.metadata[limit] + step, sign
 
 
-@pytest.mark.parametrize(("part", "name", "number", "sign"), [*limited_fields()])
+@pytest.mark.parametrize(("part", "name", "number", "sign"), sorted(limited_fields()))
 def test_every_range_is_checked(part, name, number, sign):
     sensor = Sensor(lights=tactile.Leds())
     field = getattr(getattr(sensor, part), name)
@@ -182,7 +157,7 @@ def test_an_invalid_sensor_is_not_written(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_damaged_or_missing_file_raises_an_error_that_names_it(tmp_path):
+def test_a_damaged_or_missing_file_and_an_unusable_path_are_named(tmp_path):
     path = tmp_path / "sensor.json"
     with pytest.raises(FileNotFoundError, match=r"sensor\.json"):
         Sensor.load(path)
@@ -192,14 +167,8 @@ def test_a_damaged_or_missing_file_raises_an_error_that_names_it(tmp_path):
         path.write_bytes(torn)
         with pytest.raises(OSError, match=r"sensor\.json cannot be read as JSON .* write it again with Sensor\.save"):
             Sensor.load(path)
-
-
-def test_an_unusable_path_raises_an_error_that_names_it(tmp_path):
-    with pytest.raises(OSError, match=r"cannot be read as JSON .*directory"):
-        Sensor.load(tmp_path)
     with pytest.raises(OSError, match=rf"cannot write {tmp_path}.*directory"):
         Sensor().save(tmp_path)
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OSError, match=r"cannot write .*file/sensor\.json"):
-        Sensor().save(tmp_path / "file" / "sensor.json")
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+    with pytest.raises(OSError, match=r"cannot write .*sensor\.json/below"):
+        Sensor().save(path / "below")
+    assert [found.name for found in tmp_path.iterdir()] == ["sensor.json"]

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tactile_surfaces import SHAPES, SMALL, bumpy, normals_of, some_pixels
+from tactile_surfaces import SHAPES, bumpy, normals_of, some_pixels
 
 from sts_jax import tactile
 
@@ -76,18 +76,10 @@ def test_phong_equals_the_papers_equation(shape, lights):
         )
 
 
-@pytest.mark.parametrize(
-    "lights",
-    [
-        tactile.Lights(),
-        tactile.Leds(positions=jnp.array([[-30.0, 0, -9], [30, 0, -9], [0, -30, -9], [0, 30, -9]]), reference=30.0),
-    ],
-    ids=["far", "near"],
-)
-def test_flanks_are_lit_by_the_light_that_they_face(lights):
+def test_flanks_are_lit_by_the_light_that_they_face():
     x, y = np.meshgrid(np.arange(-20, 21), np.arange(-20, 21))
     bump = jnp.asarray(np.stack([x, y, -5 * np.exp(-(x**2 + y**2) / 50)], -1), jnp.float32)  # towards the camera
-    image = np.asarray(tactile.phong(tactile.Phong(), lights, normals_of(bump), bump))
+    image = np.asarray(tactile.phong(tactile.Phong(), tactile.Lights(), normals_of(bump), bump))
     left, right, top, bottom = image[20, 14], image[20, 26], image[14, 20], image[26, 20]
     assert left[0] > right[0] + 0.2  # red from the left edge
     assert right[1] > left[1] + 0.2  # green from the right
@@ -107,18 +99,15 @@ def test_coupling_equals_a_weighted_mean_over_the_image(shape, length):
         assert got[i, j] == pytest.approx(np.sum(weights * depth) / np.sum(weights), rel=1e-4, abs=1e-9)
 
 
-@pytest.mark.parametrize("shape", SMALL)
-def test_zero_coupling_changes_nothing(shape):
+def test_zero_coupling_changes_nothing():
+    shape = (97, 53)
     depth = jnp.asarray(pressed(shape), jnp.float32)
     pitch = jnp.asarray(WINDOW[2:] / [shape[1], shape[0]], jnp.float32)
-    couple = jax.jit(tactile.couple)
     for length in (0.0, 1e-30, 1e-6):
-        np.testing.assert_array_equal(couple(depth, length, pitch), depth)
-        to_depth, to_length = jax.grad(lambda d, s: jnp.sum(couple(d, s, pitch) * depth), (0, 1))(depth, length)
-        np.testing.assert_array_equal(to_depth, depth)
-        assert float(to_length) == 0
-    uniform = jnp.full(shape, 0.001)
-    np.testing.assert_allclose(couple(uniform, 0.002, pitch), uniform, rtol=1e-5)
+        np.testing.assert_array_equal(tactile.couple(depth, length, pitch), depth)
+        by_depth, by_length = jax.grad(lambda d, s: jnp.sum(tactile.couple(d, s, pitch) * depth), (0, 1))(depth, length)
+        np.testing.assert_array_equal(by_depth, depth)
+        assert float(by_length) == 0
 
 
 def bilinear(depth, row, column):
@@ -153,11 +142,10 @@ def arriving(skin, lights, depth, i, j):
 @pytest.mark.parametrize(
     "lights",
     [
-        tactile.Lights(),
         tactile.Lights(directions=jnp.array([[-1.0, 0.3, -0.05], [0.2, 2, 0], [0, 0, -1], [0.5, -0.5, -0.2]])),
         LEDS,
     ],
-    ids=["plane", "far", "near"],
+    ids=["far", "near"],
 )
 def test_shadows_equal_a_float64_loop(shape, lights):
     depth = pressed(shape)
@@ -196,63 +184,32 @@ def test_zero_steps_and_flat_skin_give_no_shadows():
         assert np.all(np.asarray(tactile.shadows(SKIN, lights, jnp.zeros((20, 30)), window)) == 1)
 
 
-def drawing(parameters, weights):
-    """A weighted sum of the pixels of a ball's imprint, as a function of all parameters with a derivative."""
-    shape = weights.shape[:2]
-    x, y = (jnp.asarray(v, weights.dtype) for v in places(shape))
-    window = jnp.asarray(WINDOW, weights.dtype)
-    place, lights, phong = parameters["place"], parameters["lights"], parameters["phong"]
-    under = jnp.sqrt(jnp.maximum(0.03**2 - (x - place[0]) ** 2 - (y - place[1]) ** 2, 1e-6))
-    depth = jnp.maximum(under - 0.03 + place[2], 0)
-    depth = tactile.couple(depth, parameters["coupling"], window[2:] / jnp.array([shape[1], shape[0]], weights.dtype))
-    points = jnp.stack([x, y, -depth], -1)
-    shares = tactile.shadows(SKIN, lights, depth, window)
-    image = tactile.phong(phong, lights, normals_of(points), points, shares)
-    return jnp.sum(weights * image * tactile.darken(phong, depth)[..., None])
+# Along the skin, from behind it, at right angles to the view (R . V is 0 to the last digits), and straight below.
+DIRECTIONS = jnp.array([[1.0, 0, 0], [0, 0, 1], [1e-22, 0, -1e-25], [1, 0, -1e-30], [0, 0, -1]])
+# On the skin at a pixel's centre, almost on it, straight below, and in the gel's plane.
+POSITIONS = jnp.array([[0.0, 0, 0], [0, 0, -1e-12], [1e-20, 1e-20, 1e-20], [0, 0, -0.05], [0.1, 0, 0]])
+DEGENERATE = [
+    tactile.Lights(directions=DIRECTIONS, colors=jnp.ones((5, 3))),
+    tactile.Leds(positions=POSITIONS, colors=jnp.ones((5, 3))),
+    tactile.Leds(positions=POSITIONS, colors=jnp.ones((5, 3)), falloff=4.0, reference=0.1),
+]
 
 
-differentiated = jax.jit(jax.value_and_grad(drawing))
-
-
-def parameters(lights, depth):
-    return {"place": jnp.array([0.004, -0.003, depth]), "coupling": 0.0008, "lights": lights, "phong": tactile.Phong()}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("depth", [0.002, 0.0, -0.001], ids=["pressed", "touching", "flat"])
-@pytest.mark.parametrize("coupling", [0.0, 0.001])
-@pytest.mark.parametrize(
-    "lights",
-    [
-        tactile.Lights(),
-        tactile.Lights(directions=jnp.array([[0.0, 0, -1]] * 4)),  # straight below
-        LEDS,
-        # On the skin at a pixel's centre, almost on it, straight below, and in the gel's plane.
-        tactile.Leds(positions=jnp.array([[0.0, 0, 0], [0.0, 0.0, -1e-12], [0, 0, -0.05], [0.1, 0, 0]])),
-        tactile.Leds(positions=jnp.array([[0.0, 0, 0]] * 4), falloff=4.0, reference=0.1),
-    ],
-)
-def test_gradients_are_finite_in_float32(lights, coupling, depth):
-    shape = (21, 31)  # a pixel's centre lies at the origin
-    start = parameters(lights, depth) | {"coupling": coupling}
-    weights = jax.random.normal(jax.random.key(0), (*shape, 3))
-    value, gradient = differentiated(start, weights)
-    assert np.isfinite(value)
-    for path, leaf in jax.tree_util.tree_flatten_with_path(gradient)[0]:
-        assert np.all(np.isfinite(leaf)), jax.tree_util.keystr(path)
-
-
-def test_gradients_are_finite_for_degenerate_lights_and_normals():
-    # Light along the skin, from behind it, and at right angles to the view. R . V is 0 to the last digits.
-    lights = tactile.Lights(directions=jnp.array([[1.0, 0, 0], [0, 0, 1], [1e-22, 0, -1e-25], [1, 0, -1e-30]]))
+@pytest.mark.parametrize("lights", DEGENERATE, ids=["far", "near", "steep"])
+def test_gradients_are_finite_for_degenerate_lights_and_normals(lights):
     normals = jnp.array([[0.0, 0, -1], [0, 0, -1], [1, 0, 0], [0, 0, 0]])
 
-    def total(lights, normals, points, phong):
+    def lit(lights, normals, points, phong):
         return jnp.sum(tactile.phong(phong, lights, normals, points))
 
-    points = jnp.zeros((4, 3))
-    leds = tactile.Leds(positions=jnp.concatenate([points[:3], jnp.full((1, 3), 1e-20)]))
-    for given in (lights, leds):
-        for shininess in (0.5, 5.0, 200.0):
-            gradient = jax.grad(total, (0, 1, 2, 3))(given, normals, points, tactile.Phong(shininess=shininess))
-            assert all(np.all(np.isfinite(g)) for g in jax.tree.leaves(gradient))
+    def shaded(lights, depth):
+        window = jnp.asarray(WINDOW, jnp.float32)
+        return jnp.sum(tactile.shadows(SKIN, lights, tactile.couple(depth, 0.001, window[2:] / 31), window))
+
+    gradients = [
+        jax.grad(lit, (0, 1, 2, 3))(lights, normals, jnp.zeros((4, 3)), tactile.Phong(shininess=shininess))
+        for shininess in (0.5, 5.0, 200.0)
+    ]
+    for depth in (pressed((21, 31)), np.zeros((21, 31))):  # a pixel's centre lies at the origin
+        gradients.append(jax.grad(shaded, (0, 1))(lights, jnp.asarray(depth, jnp.float32)))
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(gradients))
