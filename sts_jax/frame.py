@@ -24,8 +24,7 @@ class Frame:
 
     visual: Float[Array, "*n h w 3"]  # View through the skin with the internal light off, sRGB.
     tactile: Float[Array, "*n h w 3"]  # Image of the skin's inner side with the internal light on.
-    # Depth of the object along the optical axis, from the pinhole (m), `inf` in pixels without object. The walls of the
-    # housing hide nothing in this image.
+    # Depth along the optical axis, from the pinhole (m), `inf` without object. The housing's walls hide nothing.
     depth: Float[Array, "*n h w"]
     segmentation: Bool[Array, "*n h w"]  # Pixels of the object: True where `depth` is finite.
     # Pose that is drawn, after the object has sunk into the gel: mesh frame in the sensor frame, position (m) and
@@ -74,7 +73,6 @@ def sense(
     invalid sensor or body that is not traced raises a ValueError (`Sensor.check`, `Body.check`).
 
     Args:
-        sensor: Constants of the sensor.
         body: One body. For several bodies use `objects.stack` and `jax.vmap`.
         pose: Mesh frame in the sensor frame: position (m) and quaternion [w, x, y, z].
         wrench: Wrench of the pad on the object in the sensor frame: force (N) and moment about the origin (N m).
@@ -83,9 +81,6 @@ def sense(
         crop: True to show only a window around the object, with the aspect ratio of `resolution`.
         moving_edges: True to include the motion of the imprint's edges in the derivative of the tactile image with
             respect to the pose. It serves to fit poses, and is accurate on average over a few pixels.
-
-    Returns:
-        The images, with the pose that is drawn and the pressure on the gel.
     """
     if isinstance(body, list | tuple):
         raise TypeError(f"body is a {type(body).__name__}: for several bodies use objects.stack and jax.vmap")
@@ -134,7 +129,6 @@ def expose(sensor: Sensor, frame: Frame, light: Real[ArrayLike, ""]) -> Float[Ar
     (`Room.exposure`). A pixel that is equally bright in both streams is equally bright at every level.
 
     Args:
-        sensor: Sensor that made the frame.
         frame: One frame or a batch of frames with any leading axes.
         light: Level of the internal light, from 0 (off) to 1 (full power). Traced values are clipped, and NaN is 0.
 
@@ -161,7 +155,6 @@ def touch(
     """Render the tactile image of a given imprint, such as the result of another contact model.
 
     Args:
-        sensor: Constants of the sensor.
         imprint: Depth of the skin below the gel's undeformed face at the point that each pixel shows (m), 0 without
             contact. The depth is clipped to [0, `Gel.thickness`], and NaN counts as 0.
         window: Part of the gel's outer face that the image shows: left, top, width, height (m). None selects the

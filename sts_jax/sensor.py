@@ -50,21 +50,18 @@ class Sensor:
 
         - The pinhole is at least `camera.near` below the gel's inner face, so that objects that press are drawn.
         - `gel.max_depth` is at most `gel.thickness`.
-        - Every light, internal or external, has one row in `colors` and one in `directions` or `positions`. No
-          direction is zero.
-        - Internal lights are on the camera's side of the opaque skin (z <= 0), and LEDs do not lie in the gel. They may
-          lie beside it, and behind the pinhole, because the camera casts no shadow.
+        - Every light, internal or external, has one row in `colors` and one in `directions` or `positions`.
+        - No direction is zero. Internal lights have z <= 0, below the opaque skin, and LEDs do not lie in the gel.
 
         Constants that `jit` traces cannot be checked: use `guard`.
         """
         _require(_conditions(self))
 
     def guard(self) -> tuple["Sensor", Bool[Array, ""] | bool]:
-        """Check a sensor whose constants may be traced by `jit`.
+        """Check a sensor whose constants may be traced by `jit`, and return it with a flag.
 
-        Returns:
-            The sensor and a flag. If a traced constant is out of range, all traced constants have their default values
-            and the flag is False. A constant that is not traced raises a ValueError, as in `check`.
+        If a traced constant is out of range, all traced constants have their default values and the flag is False. A
+        constant that is not traced raises a ValueError, as in `check`.
         """
         flags = []
         for holds, message in _conditions(self):
@@ -98,10 +95,9 @@ class Sensor:
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> "Sensor":
-        """Read a sensor from a file that `save` wrote, or from the sensor file of a real sensor.
+        """Read a sensor from a file that `save` wrote, or from that of a real sensor, whose entry "device" is ignored.
 
-        A missing field has its default value, and an unknown field raises a ValueError. The entry "device" of a real
-        sensor's file is ignored.
+        A missing field has its default value, and an unknown field raises a ValueError.
         """
         if not Path(path).exists():
             raise FileNotFoundError(

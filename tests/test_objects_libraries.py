@@ -35,9 +35,8 @@ def test_files_of_any_folder_take_the_axes_of_their_format_and_the_given_size(fo
     same_points(surface(objects.bodies(objects.library(folder), [0])[0][0]).vertices, turned)
     upright = objects.bodies(objects.library(folder, up="y"), [1])[0][0]  # the STL, read as the glTF is
     same_points(surface(upright).vertices, turned)
-    for arguments, size in (({"scale": 0.5}, 0.045), ({"longest_side": 0.03}, 0.03)):
-        body = objects.bodies(objects.library(folder, **arguments), [1])[0][0]
-        np.testing.assert_allclose(np.ptp(np.asarray(body.vertices), axis=0).max(), size, rtol=1e-5)
+    body = objects.read(objects.library(folder, scale=0.5), 1).body
+    np.testing.assert_allclose(np.ptp(np.asarray(body.vertices), axis=0).max(), 0.045, rtol=1e-5)
 
 
 def test_a_missing_and_an_empty_folder_and_a_bad_argument_are_refused(tmp_path):
@@ -45,8 +44,8 @@ def test_a_missing_and_an_empty_folder_and_a_bad_argument_are_refused(tmp_path):
         objects.library(tmp_path / "nowhere")
     with pytest.raises(ValueError, match=f"{tmp_path.name}: the folder contains no usable mesh"):
         objects.library(tmp_path)
-    with pytest.raises(ValueError, match="not both"):
-        objects.library(tmp_path, scale=1.0, longest_side=0.1)
+    with pytest.raises(ValueError, match="scale must be a positive number of metres per unit"):
+        objects.library(tmp_path, scale=0.0)
 
 
 def test_bad_objects_are_left_out_and_named(tmp_path):
@@ -117,4 +116,4 @@ def test_a_changed_file_image_or_setting_is_another_entry_of_the_cache(tmp_path)
     mesh = tmp_path / "models-OBJ" / "models" / "a.obj"
     mesh.write_text(mesh.read_text() + "# end\n")
     assert count() == 3
-    assert [count(longest_side=0.05), count(faces=64), count(largest=0.06)] == [4, 5, 6]
+    assert [count(scale=0.01), count(up="y")] == [4, 5]

@@ -118,6 +118,6 @@ def test_a_library_decomposes_where_the_hull_is_wrong(tmp_path):
     assert (len(box.body.hulls), len(corner.body.hulls)) == (1, 8)
     assert objects.decompose(box.body) is box.body
     assert box.gaps == pytest.approx((0, 0), abs=1e-6)
-    assert " in 2 parts; " in objects.describe(corner)
+    assert " in 2 parts; " in objects.survey(listed)[1]
     assert objects.read(listed, 1).gaps == corner.gaps
     assert len(objects.read(objects.library(tmp_path, cache=tmp_path / "kept"), 1).body.hulls) == 1

@@ -1,4 +1,3 @@
-import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -112,17 +111,6 @@ def test_a_larger_object_is_scaled_down_with_a_note(tmp_path):
     entry = objects.read(listed, 0)
     np.testing.assert_allclose(np.ptp(np.asarray(entry.body.vertices), axis=0), [0.018, 0.012, 0.12], rtol=1e-5)
     assert entry.notes == ("the longest side of 0.508 m is scaled down to 0.12 m",)
-    (note,) = objects.read(dataclasses.replace(listed, largest=0.05), 0).notes
-    assert note.endswith("scaled down to 0.05 m")
-
-
-def test_a_size_that_differs_from_the_table_is_noted(tmp_path):
-    for name, height, notes in (
-        ("a", 4, ()),
-        ("b", 3, ("the longest side in metadata.csv (aligned.dims) is 102 mm",)),
-    ):
-        listed = only(tmp_path / name, box((2, 2, height)), **{"aligned.dims": r"5.08\,5.08\,10.16"})  # cm
-        assert objects.read(listed, 0).notes == notes
 
 
 def test_cutlery_is_solid_and_of_steel(tmp_path):

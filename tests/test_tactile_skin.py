@@ -199,9 +199,11 @@ DEGENERATE = [
 def test_gradients_are_finite_for_degenerate_lights_and_normals(lights):
     normals = jnp.array([[0.0, 0, -1], [0, 0, -1], [1, 0, 0], [0, 0, 0]])
 
+    @jax.jit
     def lit(lights, normals, points, phong):
         return jnp.sum(tactile.phong(phong, lights, normals, points))
 
+    @jax.jit
     def shaded(lights, depth):
         window = jnp.asarray(WINDOW, jnp.float32)
         return jnp.sum(tactile.shadows(SKIN, lights, tactile.couple(depth, 0.001, window[2:] / 31), window))

@@ -14,7 +14,7 @@ from sts_jax.objects.body import (
 )
 from sts_jax.objects.hulls import DIRECTIONS, lattice, rest_poses, support
 from sts_jax.objects.items import Entry, Item, Library
-from sts_jax.objects.libraries import HOLLOW, bodies, describe, facts, library, read, survey
+from sts_jax.objects.libraries import HOLLOW, bodies, facts, library, read, survey
 from sts_jax.objects.meshes import load
 from sts_jax.objects.parts import decompose, gaps
 from sts_jax.objects.procedural import Family, find_family, make
@@ -34,7 +34,6 @@ __all__ = [
     "Library",
     "bodies",
     "decompose",
-    "describe",
     "facts",
     "fill_moments",
     "find_family",

@@ -33,20 +33,14 @@ def assemble(
     """Assemble a `Body` from a surface, its colours and its masses.
 
     The body collides as the convex hull of the vertices, reduced to at most 64 vertices. The centroid of this hull
-    becomes the origin of the body's coordinates. The arrays are padded to size classes.
+    becomes the origin of the body's coordinates. The arrays are padded to size classes. `Body` describes the arguments
+    of the same name.
 
     Args:
-        vertices: Vertices of the surface (m), with +z up.
-        faces: Vertex indices of each face, counter-clockwise seen from outside.
-        colors: Colour of each corner of each face, in linear light, [0, 1]. `texture` is multiplied by this colour.
         density: Mass per area of each face (kg/m^2).
         interior: Vertices and faces of a closed mesh around the contents, in the frame of `vertices`, or None.
-        contents_density: Density of the contents (kg/m^3).
         mass: Mass of the object without contents (kg), to which the masses of all faces are scaled, or None.
-        uv: Texture coordinates of each corner of each face, with v = 0 at the texture's top row.
-        texture: Square texture in linear light, [0, 1]. Its side is one of TEXTURE_CLASSES. None is one white pixel.
-        two_sided: True if faces are also visible from behind.
-        category: Index into CATEGORIES, or -1 for an object of no category.
+        texture: Its side is one of TEXTURE_CLASSES. None is one white pixel.
     """
     hull = convex_hull(vertices)
     shape = ConvexHull(hull)
@@ -92,14 +86,11 @@ def assemble(
     )
 
 
-def corner_normals(
-    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], *, crease: float = CREASE
-) -> Float[np.ndarray, "f 3 3"]:
+def corner_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3 3"]:
     """Unit normal at each corner of each face, so that shading is smooth except at sharp edges.
 
     For a corner of the face F at the vertex v, the result is the normalised mean of the normals of faces that meet at
-    v, weighted by their interior angles at v. Only faces whose normal is within `crease` (rad) of F's normal count. A
-    face without area counts as one with the normal (0, 0, 1) and the weight 0.
+    v, weighted by their interior angles at v. Only faces whose normal is within CREASE of F's normal count.
     """
     triangles = vertices[faces]
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
@@ -116,7 +107,7 @@ def corner_normals(
     first = np.repeat(np.arange(len(corner_vertex)), repeats)
     within = np.arange(len(first)) - np.repeat(np.cumsum(repeats) - repeats, repeats)
     second = order[start[corner_vertex[first]] + within]
-    near = np.einsum("pi,pi->p", flat[first // 3], flat[second // 3]) > np.cos(crease)
+    near = np.einsum("pi,pi->p", flat[first // 3], flat[second // 3]) > np.cos(CREASE)
     weight = near * angle.ravel()[second]
     normals = np.stack(
         [np.bincount(first, weight * flat[second // 3, axis], len(corner_vertex)) for axis in range(3)], axis=1

@@ -52,10 +52,7 @@ class Body:
     category: Int[Array, "*n"]  # Index into CATEGORIES, or -1 for an object of no category.
 
     def check(self) -> None:
-        """Raise a ValueError unless this is a single body with finite values and valid indices.
-
-        The check needs concrete values, so it cannot run under `jit`.
-        """
+        """Raise a ValueError unless this is a single body with finite values and valid indices, not traced by `jit`."""
         if jnp.ndim(self.vertices) != 2:
             shape = jnp.shape(self.vertices)
             raise ValueError(f"vertices has the shape {shape}, but it must be (v, 3): use jax.vmap for stacked bodies")
@@ -73,7 +70,7 @@ class Body:
                 f"faces has indices from {faces.min()} to {faces.max()}, but with {len(self.vertices)} vertices they "
                 f"must be from 0 to {len(self.vertices) - 1}"
             )
-        check_category(np.asarray(self.category).tolist())
+        check_category(int(self.category))
 
     def __repr__(self) -> str:
         arrays = [isinstance(leaf, np.ndarray | np.generic | jax.Array) for leaf in vars(self).values()]
@@ -110,10 +107,9 @@ def pad(array: np.ndarray, size: int, value: np.ndarray | float) -> np.ndarray:
     return np.concatenate([array, padding])
 
 
-def check_category(category: object) -> None:
+def check_category(category: int) -> None:
     """Raise a ValueError unless a category is an index into `CATEGORIES`, or -1."""
-    number = np.asarray(category)
-    if number.shape or number.dtype.kind not in "iu" or not -1 <= number < len(CATEGORIES):
+    if not -1 <= category < len(CATEGORIES):
         raise ValueError(
             f"category is {category!r}, but it must be -1 (an object of no category) or an index into "
             f"objects.CATEGORIES (0 to {len(CATEGORIES) - 1}), such as CATEGORIES.index('mouse')"
@@ -166,14 +162,13 @@ def rigid(
 ) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3 3"]]:
     """Mass, centre of mass and inertia of a body whose contents fill a share of its interior.
 
-    The shell has the mass m_s, the centre of mass c_s and the inertia I_s. The contents have the density rho, the
-    volume V, the centre c_c and the second moments C = int (r - c_c) (r - c_c)^T dV. Let s be the factor `shell_scale`,
-    and E the identity matrix. The mass is m = s m_s + rho V. The centre of mass c follows from
-    m c = s m_s c_s + rho V c_c. By the parallel axis theorem, the inertia about c is
-    I = s I_s + rho (tr(C) E - C) + s m_s P(c_s - c) + rho V P(c_c - c), with P(d) = (d . d) E - d d^T.
+    With the shell (m_s, c_s, I_s), s = `shell_scale`, the contents' density rho, volume V, centre c_c and second
+    moments C = int (r - c_c) (r - c_c)^T dV:
+
+        m = s m_s + rho V,    m c = s m_s c_s + rho V c_c,    P(d) = (d . d) E - d d^T
+        I = s I_s + rho (tr(C) E - C) + s m_s P(c_s - c) + rho V P(c_c - c)
 
     Args:
-        body: One body.
         fill: Share of the interior's volume that is filled from below, clipped to [0, 1].
         shell_scale: Factor on the mass and the inertia of the shell.
         up: Unit vector in the mesh frame that pointed upwards while the contents settled.
@@ -215,10 +210,9 @@ def fill_moments(
 ) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3 3"]]:
     """Volume, centre and second moments of the liquid that fills a share of a closed mesh from below.
 
-    The triangles are clipped to the half-space below the liquid's surface. Each clipped triangle and a reference point
-    form a tetrahedron with a signed volume, and the moments of the liquid are the sums over these tetrahedra. The
-    reference point lies on the liquid's surface, so that the triangles that would cover this surface add nothing.
-    Bisection finds the height of the surface.
+    The moments are sums over tetrahedra between a reference point and the triangles, clipped to the half-space below
+    the liquid. The reference point lies on the liquid's surface, so that the triangles that would cover this surface
+    add nothing. Bisection finds the height of the surface.
 
     Args:
         interior: Triangles of a closed surface (m), counter-clockwise seen from outside.

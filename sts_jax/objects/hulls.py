@@ -75,10 +75,6 @@ def outside_hull(points: Float[np.ndarray, "n 3"], hull: Float[np.ndarray, "h 3"
 
 def support(body: Body) -> Float[np.ndarray, "128"]:
     """Support function of a body: the largest v . d (m) over its collision vertices v, for each d in DIRECTIONS."""
-    if np.ndim(body.hulls) != 3:
-        raise ValueError(
-            f"body.hulls has the shape {np.shape(body.hulls)}, but it must be (parts, vertices, 3): pass a single body"
-        )
     points = np.asarray(body.hulls, np.float64).reshape(-1, 3)
     return (points @ DIRECTIONS.T.astype(np.float64)).max(axis=0).astype(np.float32)
 
@@ -86,19 +82,12 @@ def support(body: Body) -> Float[np.ndarray, "128"]:
 def rest_poses(
     points: Float[np.ndarray, "n 3"], com: Float[np.ndarray, "3"]
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k"]]:
-    """Find the orientations in which a convex hull rests on a level plane.
-
-    The hull rests on a face if the centre of mass lies above the face and at least 0.5 mm inside the outline of the
-    face.
-
-    Args:
-        points: Points whose convex hull is the object (m).
-        com: Centre of mass (m), in the same frame.
+    """Find the orientations in which the convex hull of points rests on a level plane.
 
     Returns:
-        For each of the k faces on which the hull can rest, the unit vector that then points up, in the frame of
-        `points`, and the solid angle of the face seen from the centre of mass, divided by the sum over the k faces. An
-        object is more likely to land on a face with a larger share.
+        For each of the k faces on which the hull can rest with the centre of mass `com`, the unit vector that then
+        points up, in the frame of `points`, and the solid angle of the face seen from `com`, divided by the sum over
+        the k faces. An object is more likely to land on a face with a larger share.
     """
     hull = ConvexHull(points)
     normals, offsets = hull.equations[:, :3], hull.equations[:, 3]

@@ -15,7 +15,7 @@ from sts_jax.objects.materials import references
 from sts_jax.storage import write_arrays
 
 LARGEST = 0.12  # m, larger objects are scaled down to this longest side, so that they can lie on the pad of 0.15 m
-NUM_FACES = 4096  # the largest size class whose rendering is cheap
+NUM_FACES = 4096  # the largest size class whose rendering is cheap, larger meshes are decimated
 _FORMAT = 1  # version of cached bodies, increased when the same file and settings lead to another body
 
 Vector = tuple[float, float, float]
@@ -31,9 +31,7 @@ class Item:
     up: Vector  # Direction in the file that becomes +z.
     front: Vector  # Direction in the file that becomes -y.
     scale: float | None = None  # Length of one unit of the file (m).
-    longest_side: float | None = None  # Longest side after scaling (m), instead of `scale`.
     textures: Path | None = None  # Additional folder of images.
-    stated: float | None = None  # Longest side according to ShapeNetSem's table (m).
     notes: tuple[str, ...] = ()  # Remarks on the item for the listing of the library.
 
 
@@ -46,8 +44,6 @@ class Library:
     skipped: tuple[tuple[str, str], ...]  # (name, reason) of each file or model that is not used.
     classes: tuple[str, ...]  # Classes of the items, sorted.
     cache: Path | None = None  # Folder of the cached bodies.
-    faces: int = NUM_FACES  # Largest number of faces and of vertices. Larger meshes are decimated.
-    largest: float = LARGEST  # Longest side (m) to which longer objects are scaled down.
     parts: bool = False  # True if objects that stand off their convex hull collide as convex parts.
 
 
@@ -67,9 +63,9 @@ def cache_path(library: Library, item: Item) -> Path:
     assert library.cache is not None
     digest = hashlib.sha256()
     fields = [field.name for field in dataclasses.fields(Body)]
-    settings = [item.scale, item.longest_side, item.up, item.front, item.label, item.notes]
+    settings = [item.scale, item.up, item.front, item.label, item.notes]
     layout = [_FORMAT, fields, FACE_CLASSES, HULL_CLASSES, PART_CLASSES, TEXTURE_CLASSES]
-    digest.update(json.dumps([layout, settings, library.faces, library.largest, library.parts]).encode())
+    digest.update(json.dumps([layout, settings, NUM_FACES, LARGEST, library.parts]).encode())
     try:
         named = references(item.path, item.textures)
     except (OSError, ValueError):

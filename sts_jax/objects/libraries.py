@@ -1,8 +1,6 @@
 """Collections of mesh files: ShapeNetSem as downloaded, or any folder of meshes with one sub-folder per class.
 
-`library` lists the objects of a folder without opening a mesh. `read` loads one object, `bodies` several. `survey`
-loads all objects once, fills the cache if there is one, and describes each object. `bodies` and `survey` continue after
-an object that cannot be loaded.
+`bodies` and `survey` continue after an object that cannot be loaded.
 """
 
 import dataclasses
@@ -17,10 +15,11 @@ import numpy as np
 import trimesh
 from scipy.spatial import ConvexHull
 
+from sts_jax._checked import checked
 from sts_jax.objects import shapenet
 from sts_jax.objects.assembly import STEEL, WALL
 from sts_jax.objects.body import CATEGORIES, Body
-from sts_jax.objects.checks import check_settings
+from sts_jax.objects.checks import check_positive
 from sts_jax.objects.items import (
     LARGEST,
     NUM_FACES,
@@ -44,50 +43,38 @@ _NO_MESH = {"zip", "gz", "tar.gz", "bz2", "tar.bz2", "xyz", "dxf", "svg", "json"
 _OTHERS = {".3ds", ".3mf", ".blend", ".dae", ".fbx", ".step", ".stp", ".usd", ".usdz", ".wrl", ".x3d"}
 
 
+@checked
 def library(
     folder: str | os.PathLike[str],
     *,
     cache: str | os.PathLike[str] | None = None,
     scale: float | None = None,
-    longest_side: float | None = None,
     up: Literal["x", "y", "z"] | None = None,
-    faces: int = NUM_FACES,
-    largest: float = LARGEST,
     parts: bool = False,
 ) -> Library:
-    """List the objects of a folder without opening a mesh.
+    """List the objects of a folder without opening a mesh, sorted by class and name.
+
+    Objects longer than 0.12 m are scaled down to this length, and meshes of more than 4,096 faces or vertices are
+    decimated, which needs the package fast-simplification.
 
     If the folder or one of its direct sub-folders contains ShapeNetSem's metadata.csv, this table lists the objects,
-    with their size (`unit`), orientation (`up`, `front`) and class (`category`), one of CATEGORIES. Meshes are expected
-    at models-OBJ/models/ID.obj, and images in models-textures/textures. In any other folder, every mesh file is an
-    object. Its class is the name of the first sub-folder in its path, or of the folder itself.
+    with their size, orientation and class. Meshes are expected at models-OBJ/models/ID.obj, and images in
+    models-textures/textures. In any other folder, every mesh file is an object. Its class is the name of the first
+    sub-folder in its path, or of the folder itself.
 
     Args:
         folder: Folder of the objects.
         cache: Folder for the loaded bodies, which is created if it is missing. None loads the mesh files each time.
         scale: Length of one unit of the files (m). None uses ShapeNetSem's table, or 1 m without a table.
-        longest_side: Length to which the longest side of every object is scaled (m), from 5 mm to 0.15 m. None keeps
-            the sizes. Must be None if `scale` is given.
         up: Axis of the files that becomes +z. None uses ShapeNetSem's table. Without a table, None is "y" for glTF and
             "z" for other formats.
-        faces: Largest number of faces and of vertices, at least 4. Larger meshes are decimated, which needs the package
-            fast-simplification.
-        largest: Upper limit for the longest side (m), from 5 mm to 0.15 m, to which larger objects are scaled down.
         parts: If True, objects whose convex hull reaches more than 2 mm outside the surface are decomposed into convex
             parts. This takes about ten seconds per object and needs the package coacd.
-
-    Returns:
-        The library. Its objects are sorted by class and name.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder of objects: check the path")
-    try:
-        check_settings(longest_side=longest_side, scale=scale, largest=largest, faces=faces)
-    except ValueError as error:
-        raise ValueError(f"{folder}: {error}") from None
-    if up is not None and up not in AXES:
-        raise ValueError(f"{folder}: up must be 'x', 'y' or 'z', got {up!r}")
+    check_positive("scale", scale, "metres per unit of the files")
     root = shapenet.find_root(folder)
     items, skipped = _walked(folder) if root is None else shapenet.items(root)
     if not items:
@@ -96,8 +83,8 @@ def library(
             f"{folder}: the folder contains no usable mesh (number of skipped files: {len(skipped)}): give a folder "
             f"with mesh files that `objects.load` can read{reasons}"
         )
-    if scale is not None or longest_side is not None:
-        items = [dataclasses.replace(item, scale=scale, longest_side=longest_side, stated=None) for item in items]
+    if scale is not None:
+        items = [dataclasses.replace(item, scale=scale) for item in items]
     if up is not None:
         items = [dataclasses.replace(item, up=AXES[up][0], front=AXES[up][1]) for item in items]
     items.sort(key=lambda item: (item.label, item.name))
@@ -107,8 +94,6 @@ def library(
         skipped=tuple(sorted(skipped)),
         classes=tuple(sorted({item.label for item in items})),
         cache=None if cache is None else Path(cache),
-        faces=faces,
-        largest=largest,
         parts=parts,
     )
 
@@ -139,11 +124,9 @@ def _walked(folder: Path) -> tuple[list[Item], list[tuple[str, str]]]:
 
 
 def read(collection: Library, index: int) -> Entry:
-    """Load one item as a body, through the cache if the library has one.
+    """Load one item as a body, through the cache if the library has one. Warnings of `load` become notes.
 
-    Scissors, forks and spoons are solid and of steel. All other objects are shells with contents. Warnings of `load`,
-    such as those about repairs of the mesh, are returned as notes. Raises a ValueError with the reason if the file
-    cannot be loaded as a body.
+    Scissors, forks and spoons are solid and of steel. All other objects are shells with contents.
     """
     item = collection.items[index]
     if collection.cache is None:
@@ -157,15 +140,7 @@ def read(collection: Library, index: int) -> Entry:
 
 
 def bodies(collection: Library, indices: Iterable[int] | None = None) -> tuple[list[Body], list[tuple[str, str]]]:
-    """Load several items as bodies.
-
-    Args:
-        collection: Library that the function `library` returned.
-        indices: Indices of the items in `collection.items`. None selects all items.
-
-    Returns:
-        The bodies, and (name, reason) of each item that cannot be loaded.
-    """
+    """Load the items with these indices, or all items: the bodies, and (name, reason) of each that cannot be loaded."""
     loaded, skipped = [], []
     for index in range(len(collection.items)) if indices is None else indices:
         entry = _read_or_reason(collection, index)
@@ -177,14 +152,10 @@ def bodies(collection: Library, indices: Iterable[int] | None = None) -> tuple[l
 
 
 def survey(collection: Library, *, progress: Callable[[str], None] | None = None) -> tuple[Library, str]:
-    """Load every item once, to find the items that cannot be loaded and to describe all items in a listing.
-
-    Args:
-        collection: Library that the function `library` returned.
-        progress: Function that is called after each item with the text line that describes the item.
+    """Load every item once. `progress` is called after each item with the line that describes it.
 
     Returns:
-        The library, with the items that cannot be loaded moved to `skipped`, and the listing.
+        The library, with the items that cannot be loaded moved to `skipped`, and a listing of all items.
     """
     items, skipped, lines = [], list(collection.skipped), []
     for index, item in enumerate(collection.items):
@@ -194,7 +165,8 @@ def survey(collection: Library, *, progress: Callable[[str], None] | None = None
             line = f"{item.label}  {item.name}: left out: {entry}"
         else:
             items.append(item)
-            line = describe(entry)
+            line = "; ".join([*facts(entry.body, entry.gaps), *entry.notes])
+            line = f"{item.label}  {item.name}: {line}"
             lines.append(line)
         if progress is not None:
             progress(line)
@@ -215,16 +187,8 @@ def survey(collection: Library, *, progress: Callable[[str], None] | None = None
     return usable, "\n".join([*head, *lines, *(tail if usable.skipped else [])]) + "\n"
 
 
-def describe(entry: Entry) -> str:
-    """Describe a loaded mesh file in one line of text, as `survey` does."""
-    return f"{entry.item.label}  {entry.item.name}: " + "; ".join([*facts(entry.body, entry.gaps), *entry.notes])
-
-
 def facts(body: Body, apart: tuple[float, float]) -> list[str]:
-    """Describe a body in four short texts: size (mm), number of faces, collision vertices, and `gaps` (mm).
-
-    `apart` are the two distances from `gaps` (m).
-    """
+    """Describe a body in four short texts: size (mm), number of faces, collision vertices, and gaps `apart` (mm)."""
     size = " x ".join(f"{side * 1e3:.0f}" for side in np.ptp(np.asarray(body.vertices), axis=0))
     drawn = int(np.asarray(body.faces).any(axis=1).sum())
     hulls = np.asarray(body.hulls)
@@ -257,21 +221,17 @@ def _load(collection: Library, item: Item) -> Entry:
         body = load(
             item.path,
             scale=item.scale,
-            longest_side=item.longest_side,
-            largest=collection.largest,
+            largest=LARGEST,
             density=STEEL if solid else WALL,
             hollow=not solid,
             up=item.up,
             front=item.front,
             textures=item.textures,
-            faces=collection.faces,
+            faces=NUM_FACES,
             category=CATEGORIES.index(item.label) if item.label in CATEGORIES else -1,
         )
     notes = [_short(warning.message, item) for warning in caught]
     vertices = np.asarray(body.vertices, float)
-    longest = float(np.ptp(vertices, axis=0).max())
-    if item.stated is not None and not 0.9 < longest / min(item.stated, collection.largest) < 1.1:
-        notes.append(f"the longest side in metadata.csv (aligned.dims) is {item.stated * 1e3:.0f} mm")
     shape = ConvexHull(np.asarray(body.hulls[0], float))
     thickness = float(np.ptp(vertices @ shape.equations[:, :3].T, axis=0).min())
     if thickness < THINNEST:

@@ -16,12 +16,7 @@ PLAIN = 0.7  # sRGB grey of a mesh without colours
 
 
 def references(path: Path, images: Path | None = None) -> dict[str, Path | None]:
-    """Find the materials and images to which an OBJ file refers (`map_Kd`), or the files of a glTF.
-
-    Returns:
-        Dictionary from the name of each file, as written in the mesh or material file, to its path, or None if it is
-        missing. Images are also looked up in the folder `images`.
-    """
+    """Map the names in an OBJ file (materials, `map_Kd`) or in a glTF to paths, or to None where a file is missing."""
     if path.suffix.lower() == ".gltf":
         tree = json.loads(path.read_text())
         names = [part.get("uri", "data:") for key in ("buffers", "images") for part in tree.get(key, [])]
@@ -34,19 +29,14 @@ def references(path: Path, images: Path | None = None) -> dict[str, Path | None]
     return files
 
 
-def check_materials(path: Path, images: Path | None, strict: bool) -> None:
-    """Check the materials and images of an OBJ, because trimesh silently ignores missing and damaged ones.
-
-    A missing file is a warning, or an error if `strict`. An image that cannot be read is an error.
-    """
+def check_materials(path: Path, images: Path | None) -> None:
+    """Check the materials and images of an OBJ, because trimesh silently ignores missing and damaged ones."""
     if path.suffix.lower() != ".obj":
         return
     files = references(path, images)
     missing = ", ".join(str(path.parent / name) for name, file in files.items() if file is None)
     if missing:
         problem = f"{path}: the mesh refers to missing files: {missing}. Add them, or give an image (argument texture)"
-        if strict:
-            raise FileNotFoundError(problem)
         warnings.warn(problem, stacklevel=3)
     for file in files.values():
         if file is not None and file.suffix.lower() != ".mtl":
@@ -65,10 +55,7 @@ def read_image(path: Path) -> Image.Image:
 
 
 class Resolver(trimesh.resolvers.FilePathResolver):
-    """Gives trimesh the content of the files to which a mesh file refers.
-
-    A file is looked up at its path relative to the mesh file, and then by its base name in the folder `images`.
-    """
+    """Gives trimesh the files to which a mesh file refers, also from the folder `images`."""
 
     def __init__(self, path: Path, images: Path) -> None:
         super().__init__(str(path))
@@ -95,12 +82,7 @@ def _named(file: Path, word: str) -> list[str]:
 
 
 def albedo(path: Path, pieces: list[trimesh.Trimesh]) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Extract colours, texture coordinates and one common texture from all meshes of a file.
-
-    Returns:
-        Colours (f, 3, 3) in linear light and texture coordinates (f, 3, 2) at the corners of all f faces, and a square
-        texture in linear light, or None if no mesh has one.
-    """
+    """Colours (f, 3, 3), texture coordinates (f, 3, 2) and the common texture, if any, of a file, in linear light."""
     is_linear = path.suffix.lower() in (".glb", ".gltf")
     colors, uvs, images = [], [], []
     for piece in pieces:

@@ -11,9 +11,10 @@ import trimesh
 from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
+from sts_jax._checked import checked
 from sts_jax.objects.assembly import CONTENTS, WALL, assemble
 from sts_jax.objects.body import FACE_CLASSES, PAD, SMALLEST, Body, check_category
-from sts_jax.objects.checks import check_file, check_positive, check_settings, checked_corners
+from sts_jax.objects.checks import check_file, check_positive, check_side, checked_corners
 from sts_jax.objects.hulls import convex_hull
 from sts_jax.objects.materials import Resolver, albedo, check_materials, read_image
 from sts_jax.objects.parts import decompose
@@ -33,12 +34,8 @@ def rotation(up: Sequence[float], front: Sequence[float]) -> Float[np.ndarray, "
 
     If the directions are not perpendicular, only the component of `front` perpendicular to `up` is turned to -y.
     """
-    try:
-        z, y = np.array(up, float), -np.array(front, float)
-        valid = z.shape == y.shape == (3,) and np.isfinite([z, y]).all() and np.linalg.norm(z) > 0
-    except (TypeError, ValueError):  # not numbers
-        valid = False
-    if not valid:
+    z, y = np.array(up, float), -np.array(front, float)
+    if not (np.isfinite([z, y]).all() and np.linalg.norm(z) > 0):
         raise ValueError(f"up and front must be three finite numbers, and up not (0, 0, 0), got {up} and {front}")
     z /= np.linalg.norm(z)
     across = y - (y @ z) * z
@@ -48,6 +45,7 @@ def rotation(up: Sequence[float], front: Sequence[float]) -> Float[np.ndarray, "
     return np.stack([np.cross(y, z), y, z])
 
 
+@checked
 def load(
     path: str | os.PathLike[str],
     *,
@@ -57,7 +55,6 @@ def load(
     mass: float | None = None,
     density: float = WALL,
     hollow: bool = True,
-    strict: bool = False,
     up: Literal["x", "y", "z"] | tuple[float, float, float] = "z",
     front: tuple[float, float, float] | None = None,
     texture: str | os.PathLike[str] | None = None,
@@ -72,11 +69,10 @@ def load(
     hull: the convex hull of the mesh, reduced to at most 64 vertices. `gaps` measures how far the surface lies outside.
     Surfaces that are not closed are visible from both sides.
 
-    The albedo at a point of a face is the texture's value times the interpolated colour of the face's corners, in
-    linear light. Textures, 8-bit colours and the diffuse colour `Kd` of an OBJ file are read as sRGB. Colour factors
-    and vertex colours of a glTF file are read as linear light (glTF specification). Alpha values are ignored, and so is
-    the `Kd` of a material with a texture. Textures are resized to a square of 1, 256 or 1,024 pixels, and several are
-    packed into one square. The repetitions of a texture within a face are then lost.
+    Textures, 8-bit colours and the diffuse colour `Kd` of an OBJ file are read as sRGB. Colour factors and vertex
+    colours of a glTF file are read as linear light (glTF specification). Alpha values are ignored, and so is the `Kd`
+    of a material with a texture. Textures are resized to a square of 1, 256 or 1,024 pixels, and several are packed
+    into one square. The repetitions of a texture within a face are then lost.
 
     Args:
         path: The mesh file. Its materials and images are looked up in the same folder.
@@ -89,9 +85,7 @@ def load(
             of the shell from `density`.
         density: Mass of the shell per area (kg/m^2), if `mass` is None.
         hollow: If True and `mass` is None, the body can hold contents of 1,000 kg/m^3. The filled share is an argument
-            of `rigid`.
-        strict: If True, a mesh that is not closed or encloses no volume is an error, and so is a missing material or
-            image of an OBJ file. If False, there is a warning, and the convex hull of the mesh bounds the contents.
+            of `rigid`. The convex hull bounds the contents of a mesh that is not closed, with a warning.
         up: Axis of the file, or direction in the file, that becomes +z. The convention of glTF files is "y".
         front: Direction in the file that becomes -y, by default (0, -1, 0). Must be None if `up` is an axis.
         texture: Image file that replaces the file's own textures. It needs texture coordinates in the mesh.
@@ -103,7 +97,13 @@ def load(
     """
     path = Path(path)
     try:
-        check_settings(longest_side=longest_side, scale=scale, largest=largest, faces=faces)
+        check_positive("scale", scale, "metres per unit of the file")
+        check_side("longest_side", longest_side)
+        check_side("largest", largest)
+        if longest_side is not None and scale is not None:
+            raise ValueError("give longest_side or scale, not both")
+        if faces is not None and faces < 4:
+            raise ValueError(f"faces must be a whole number >= 4, got {faces!r}")
         check_positive("mass", mass, "kilograms")
         check_positive("density", density, "kilograms per square metre")
         check_category(category)
@@ -111,7 +111,7 @@ def load(
         check_file(path)
         images = None if textures is None else Path(textures)
         if texture is None:
-            check_materials(path, images, strict)
+            check_materials(path, images)
         pieces = _read(path, images)
         corners = checked_corners(pieces, faces) @ turn.T
         if texture is not None:
@@ -119,7 +119,7 @@ def load(
         surface = merge(corners * _factor(path, corners, longest_side, scale, largest), *albedo(path, pieces))
         if faces is not None and max(len(surface.faces), len(surface.vertices)) > faces:
             surface = decimate(path, surface, faces)
-        body = _body(path, surface, mass, density, hollow, strict, category)
+        body = _body(path, surface, mass, density, hollow, category)
         return decompose(body) if parts else body
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
@@ -131,7 +131,7 @@ def _attitude(
     """Return the rotation matrix for the arguments `up` and `front` of `load`."""
     if not isinstance(up, str):
         return rotation(up, AXES["z"][1] if front is None else front)
-    if up not in AXES or front is not None:
+    if front is not None:
         raise ValueError(f"with up={up!r} and front={front}: give an axis x, y or z without front, or two directions")
     return rotation(*AXES[up])
 
@@ -188,9 +188,7 @@ def _factor(
     return factor
 
 
-def _body(
-    path: Path, surface: Surface, mass: float | None, density: float, hollow: bool, strict: bool, category: int
-) -> Body:
+def _body(path: Path, surface: Surface, mass: float | None, density: float, hollow: bool, category: int) -> Body:
     """Make a body of a surface. If the surface encloses no volume, its convex hull bounds the contents."""
     vertices, faces, colors, uv, texture = surface
     if max(len(faces), len(vertices)) > FACE_CLASSES[-1]:
@@ -209,12 +207,8 @@ def _body(
     interior = (vertices, faces)
     holds = hollow and mass is None
     if not (closed and abs(mesh.volume) > 1e-6 * hull.volume):
-        fault = "encloses no volume" if closed else "is not closed"
-        if strict:
-            raise ValueError(
-                f"the mesh {fault}: repair the mesh, or give strict=False, so that its convex hull bounds the contents"
-            )
         if holds:
+            fault = "encloses no volume" if closed else "is not closed"
             warnings.warn(
                 f"{path}: the mesh {fault}, so its convex hull ({hull.volume * 1e6:.3g} ml) is used as the space that "
                 "the contents can fill",

@@ -71,20 +71,10 @@ def gaps(body: Body) -> tuple[float, float]:
 def surface_gaps(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], hulls: Sequence[Float[np.ndarray, "_ 3"]]
 ) -> tuple[float, float]:
-    """Largest distances between a visible surface and its collision parts.
+    """Largest distances (m) of a visible surface outside its collision parts, and of the parts outside the surface.
 
-    The distances are exact, at the vertices of the surface and of the parts and at 10,000 further points of each, so a
-    maximum between these points is missed. With only one part, the first value is exact.
-
-    Args:
-        vertices: Vertices of the visible surface (m).
-        faces: Vertex indices of each face, counter-clockwise seen from outside.
-        hulls: Vertices of each convex part (m).
-
-    Returns:
-        Largest distance (m) by which the surface lies outside all parts and can sink into the pad, and largest distance
-        (m) by which the parts lie outside the surface, such as in the hollow of a bowl. A surface that is not closed
-        has no outside: the second value is then the largest distance from the parts to it.
+    They are measured at the vertices of both and at 10,000 further points of each. A surface that is not closed has no
+    outside: the second value is then the largest distance from the parts to it.
     """
     points = np.concatenate([np.unique(vertices[faces].reshape(-1, 3), axis=0), _points(vertices[faces], 10_000)])
     shapes = [ConvexHull(hull) for hull in hulls]
@@ -113,9 +103,7 @@ def _points(triangles: np.ndarray, num: int) -> np.ndarray:
 def _reach(points: np.ndarray, triangles: np.ndarray, closed: bool) -> float:
     """Compute the largest distance (m) from triangles, over the points outside them or over all if not `closed`.
 
-    The distance from a point to the nearest corner or sample of the triangles is an upper bound. Therefore the exact
-    distance is computed only for points whose bound exceeds the largest distance so far, and only to triangles within
-    the bound.
+    The distance to the nearest corner or sample of the triangles is an upper bound, which limits the exact search.
     """
     bound = KDTree(np.concatenate([_points(triangles, 10_000), triangles.reshape(-1, 3)])).query(points)[0]
     center = triangles.mean(axis=1)

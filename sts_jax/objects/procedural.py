@@ -1,8 +1,4 @@
-"""Procedural objects: the registry of families, and `make`, which generates an object of a family from a random key.
-
-Each family has a module in `objects.families`, which builds the parts of an object with `objects.shapes` and
-`objects.colors`, on the host and in millimetres.
-"""
+"""Procedural objects: the registry of families, and `make`, which generates an object of a family from a random key."""
 
 import dataclasses
 import importlib
@@ -15,7 +11,7 @@ from jaxtyping import PRNGKeyArray
 from sts_jax._checked import check_key
 from sts_jax.objects.assembly import CONTENTS, assemble
 from sts_jax.objects.body import CATEGORIES, FACE_CLASSES, PAD, SMALLEST, Body
-from sts_jax.objects.families import bottle, camera, fork, mouse, scissors, spoon, watch, webcam
+from sts_jax.objects.families import bottle, camera, cutlery, mouse, scissors, watch, webcam
 from sts_jax.objects.shapes import Part
 
 
@@ -35,24 +31,25 @@ class Family:
     seed: int
     parts: Callable[[np.random.Generator], list[Part]]
 
-    def __post_init__(self) -> None:
-        if type(self.seed) is not int or self.seed < 0:
-            raise ValueError(f"family {self.name}: seed must be a whole number >= 0, got {self.seed!r}")
-
 
 # Seeds never change, so that equal keys lead to equal objects in every version.
-_MODULES = (bottle, camera, webcam, mouse, scissors, fork, spoon, watch)
-FAMILIES = {
-    name: Family(name, seed, module.parts) for seed, (name, module) in enumerate(zip(CATEGORIES, _MODULES, strict=True))
-}
+_PARTS = (
+    bottle.parts,
+    camera.parts,
+    webcam.parts,
+    mouse.parts,
+    scissors.parts,
+    cutlery.fork,
+    cutlery.spoon,
+    watch.parts,
+)
+FAMILIES = {name: Family(name, seed, parts) for seed, (name, parts) in enumerate(zip(CATEGORIES, _PARTS, strict=True))}
 
 
 def find_family(category: str) -> Family:
-    """Return the family of a category.
+    """Return the family of a category: one of CATEGORIES, or "module:NAME" for a `Family` of your own.
 
-    Args:
-        category: One of CATEGORIES, such as "bottle", or "module:NAME" for a `Family` of your own. The module is
-            imported, and its variable NAME must hold the family. The module of a notebook or script is `__main__`.
+    The module is imported, and its variable NAME must hold the family. That of a notebook or script is `__main__`.
     """
     if category in FAMILIES:
         return FAMILIES[category]
@@ -75,14 +72,9 @@ def find_family(category: str) -> Family:
 
 
 def make(key: PRNGKeyArray, category: str | Family) -> Body:
-    """Generate a random object of a category. Equal keys lead to equal objects.
+    """Generate a random object of a category: a `Family` or a name for `find_family`. Equal keys lead to equal objects.
 
-    Args:
-        key: Key from `jax.random.key`, consumed by the call.
-        category: A name in CATEGORIES, a `Family`, or "module:NAME" (see `find_family`).
-
-    Returns:
-        A body whose +z axis points up in its usual pose. The longest side is 50 to 130 mm for the CATEGORIES.
+    Its +z axis points up in its usual pose. The longest side is 50 to 130 mm for the CATEGORIES.
     """
     check_key(key)
     family = find_family(category) if isinstance(category, str) else category

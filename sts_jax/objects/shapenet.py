@@ -116,10 +116,7 @@ def _item(row: dict[str, str], path: Path, name: str, label: str, images: Path |
     notes = [f"metadata.csv has no {key}: ShapeNet's default is used" for key in missing]
     up, front = _vector(row["up"], "up") or _UP, _vector(row["front"], "front") or _FRONT
     rotation(up, front)  # raises an error if they do not define a rotation
-    # ShapeNetSem's README gives these in metres, but the released table holds centimetres.
-    sides = _vector(row.get("aligned.dims", ""), "aligned.dims")
-    stated = None if sides is None else max(sides) / 100
-    return Item(path, name, label, up, front, scale=scale, textures=images, stated=stated, notes=tuple(notes))
+    return Item(path, name, label, up, front, scale=scale, textures=images, notes=tuple(notes))
 
 
 def _vector(text: str, key: str) -> Vector | None:

@@ -206,11 +206,9 @@ def move(part: Part, shift: Sequence[Number] = (0, 0, 0), *, axis: str = "z", sp
     return part._replace(vertices=part.vertices @ (_TURNS[axis] @ rotation_about_z(spin)).T + np.asarray(shift, float))
 
 
-def mirrored(part: Part, axis: int = 0) -> Part:
-    """Mirror a part: change the sign of the coordinate `axis` of every vertex."""
-    flip = np.ones(3)
-    flip[axis] = -1
-    return part._replace(vertices=part.vertices * flip, faces=part.faces[:, ::-1])
+def mirrored(part: Part) -> Part:
+    """Mirror a part: change the sign of all x coordinates."""
+    return part._replace(vertices=part.vertices * [-1.0, 1.0, 1.0], faces=part.faces[:, ::-1])
 
 
 def scaled(parts: list[Part], longest: Number) -> list[Part]:

@@ -20,14 +20,7 @@ class Surface(NamedTuple):
 
 
 def merge(corners: np.ndarray, colors: np.ndarray, uv: np.ndarray, texture: np.ndarray | None) -> Surface:
-    """Make a surface from separate faces. Corners at the same place become one vertex (see `proper`).
-
-    Args:
-        corners: Corners of each face, (f, 3, 3) (m).
-        colors: Colour at each corner, (f, 3, 3), in linear light.
-        uv: Texture coordinates at each corner, (f, 3, 2).
-        texture: Texture (t, t, 3) in linear light, or None.
-    """
+    """Make a surface from the corners (f, 3, 3) of separate faces (m). Corners at the same place become one vertex."""
     grain = np.ptp(corners, axis=(0, 1)).max() * 1e-7
     _, first, index = np.unique(
         np.round(corners.reshape(-1, 3) / grain), axis=0, return_index=True, return_inverse=True
@@ -53,12 +46,10 @@ def proper(surface: Surface) -> Surface:
 
 
 def is_closed(faces: np.ndarray) -> bool:
-    """Return whether triangular faces (f, 3) form a closed surface.
+    """Return whether triangular faces (f, 3) have the edge a to b as often as b to a, for all vertices a and b.
 
-    The face (a, b, c) has the directed edges a to b, b to c and c to a. A surface counts as closed if its faces have
-    the edge a to b as often as the edge b to a, for all vertices a and b. A surface of a single part then has no holes,
-    and all of its faces have the same orientation. Closed parts that touch and share vertices also count as closed,
-    although more than two faces can meet at an edge.
+    A surface of a single part then has no holes, and all of its faces have the same orientation. Closed parts that
+    share vertices also count as closed, although more than two faces can meet at an edge.
     """
     start, end = faces.reshape(-1).astype(np.int64), np.roll(faces, -1, axis=1).reshape(-1)
     edge = np.minimum(start, end) * (faces.max() + 1) + np.maximum(start, end)
@@ -69,11 +60,7 @@ def is_closed(faces: np.ndarray) -> bool:
 def surface_samples(
     triangles: Float[np.ndarray, "f 3 3"], num: int
 ) -> tuple[Int[np.ndarray, "num"], Float[np.ndarray, "num 3"]]:
-    """Sample points from triangles, evenly by area and with a fixed seed.
-
-    Returns:
-        Index of the triangle of each point, and the barycentric weights of the three corners.
-    """
+    """Sample points from triangles, evenly by area and with a fixed seed: triangles and barycentric weights."""
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     share = np.cumsum(np.linalg.norm(cross, axis=1))
     face = np.searchsorted(share, (np.arange(num) + 0.5) / num * share[-1])

@@ -28,15 +28,11 @@ def photograph(
     """Draw triangles as seen from any viewpoint, in daylight and lamplight, before a white background. +z is up.
 
     Args:
-        vertices: Vertices in the world frame (m).
         faces: Vertex indices of each face, counter-clockwise as seen from outside the object.
-        normals: Unit normal at each corner of each face.
         albedo: Linear RGB colour in [0, 1] at each corner of each face.
         eye: Position of the camera (m). It must not be straight above or below the target.
         target: Point in the middle of the picture (m).
         fov: Vertical field of view (rad).
-        resolution: Height and width of the picture (pixels).
-        two_sided: If True, faces are also visible from behind.
 
     Returns:
         Picture, sRGB in [0, 1].

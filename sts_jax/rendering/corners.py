@@ -22,11 +22,7 @@ class Corners(NamedTuple):
 def weights(
     corners: Corners, winner: Int[Array, "h w"], column: Float[Array, "h w"], row: Float[Array, "h w"]
 ) -> tuple[list[Int[Array, "h w"]], tuple[Float[Array, "h w"], ...]]:
-    """Vertex indices and barycentric weights of the three corners of the face that is visible at each pixel.
-
-    `winner` is the index of the visible face. A negative index, for a pixel without a face, gives the corners of face
-    0.
-    """
+    """Vertex indices and barycentric weights of the corners of the face `winner` that is visible at each pixel."""
     of_face = corners.faces[jnp.maximum(winner, 0)]
     indices = [of_face[..., k] for k in range(3)]
     return indices, optics.barycentrics([(corners.column[k], corners.row[k]) for k in indices], column, row)

@@ -1,7 +1,4 @@
-"""The second of the two compiled programs of `sense`: it draws the visual, tactile and depth images of an object.
-
-It is compiled again for each new resolution.
-"""
+"""The second of the two compiled programs of `sense`, one for each resolution: it draws the images of an object."""
 
 import functools
 import operator

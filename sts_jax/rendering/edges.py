@@ -35,13 +35,8 @@ def with_moving_edges(
     micro-edges of Pidhorskyi et al. 2024, "Rasterized Edge Gradients". The derivative is accurate on average over a few
     pixels.
 
-    Args:
-        imprint: Depth of the imprint below the undeformed surface of the gel (m).
-        corners: Faces of the object, and for each vertex its position in the image and 1 / depth (1/m).
-        images: Index of the visible face at each pixel, column and row of each pixel.
-        depth: Depth of the object from the pinhole (m), `inf` where there is no object.
-        on_pad: True for pixels whose rays pass through the pad.
-        follows: True where the imprint follows the surface of the object: it presses, and the imprint is not clipped.
+    `images` are the arguments `winner`, `column` and `row` of `weights`, and `follows` is True where the object presses
+    and the imprint is not clipped.
     """
     return imprint
 

@@ -18,17 +18,10 @@ def lit_skin(
     pitch: Float[Array, "2"],
     slopes: tuple[Float[Array, "1 b"], Float[Array, "a 1"]],
 ) -> list[Float[Array, "h w"]]:
-    """Brightness of the gel's skin under the lights inside the sensor, for a grid of camera rays.
+    """Red, green and blue light of the skin for a grid of camera rays, not clipped, from the depth of the imprint (m).
 
-    Args:
-        sensor: Constants of the sensor.
-        imprint: Depth of the imprint below the gel's face (m), for each ray.
-        window: Part of the gel's face that the grid covers: left, top, width, height (m).
-        pitch: Distance between rays along x and y on the gel's face (m).
-        slopes: x / depth at each column, and y / depth at each row.
-
-    Returns:
-        Red, green and blue channel, not clipped, without the outermost rows and columns, which have no normals.
+    `window` is the part of the gel's face that the grid covers (m), `pitch` the distance between rays there (m), and
+    `slopes` are x / depth and y / depth. The outermost rows and columns, which have no normals, are dropped.
     """
     coupled = sensor.skin.coupling > 0
     imprint = jax.lax.cond(coupled, tactile.couple, lambda *given: given[0], imprint, sensor.skin.coupling, pitch)
