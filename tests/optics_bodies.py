@@ -1,5 +1,7 @@
 """Bodies from trimesh's primitives, and reference values from embree, for the tests of optics, tactile and frame."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import trimesh
@@ -7,9 +9,10 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from benchmarks.instruments.truth import body_mesh, embree, interior, public_meshes
+from sts_jax import Frame
 from sts_jax.objects.body import FACE_CLASSES, Body
 
-__all__ = ["at", "body_mesh", "embree", "from_trimesh", "interior", "public_meshes", "rays_hidden", "weight"]
+__all__ = ["body_mesh", "embree", "interior", "public_meshes"]  # of the benchmarks
 
 
 def at(x, y, z, turn=(1.0, 0, 0, 0)):
@@ -20,6 +23,37 @@ def at(x, y, z, turn=(1.0, 0, 0, 0)):
 def weight(force, x, y):
     """The wrench of a load (N) with the centre of pressure (x, y) (m)."""
     return jnp.array([0.0, 0.0, force, y * force, -x * force, 0.0], jnp.float32)
+
+
+def with_field(sensor, field, value):
+    """The sensor with another value of a field such as `gel.stiffness`."""
+    part, name = field.split(".")
+    return dataclasses.replace(sensor, **{part: dataclasses.replace(getattr(sensor, part), **{name: value})})
+
+
+def noise(shape, seed=0):
+    """A frame of random images with black and white pixels, with an object in its first quarter."""
+    rng = np.random.default_rng(seed)
+    images = rng.uniform(size=(2, *shape, 3)).astype(np.float32)
+    images[rng.uniform(size=images.shape) < 0.05] = 0
+    images[rng.uniform(size=images.shape) < 0.05] = 1
+    lead, seen = shape[:-2], np.arange(np.prod(shape)).reshape(shape) < np.prod(shape) / 4
+    return Frame(
+        visual=jnp.asarray(images[0]),
+        tactile=jnp.asarray(images[1]),
+        depth=jnp.where(seen, 0.1, jnp.inf),
+        segmentation=jnp.asarray(seen),
+        pose=jnp.broadcast_to(at(0, 0, 0.01), (*lead, 7)),
+        balanced=jnp.ones(lead, bool),
+        pressure=jnp.asarray(rng.uniform(0, 2000, (*lead, 5, 5)), jnp.float32),
+        window=jnp.broadcast_to(jnp.array([-0.1, -0.1, 0.2, 0.2]), (*lead, 4)),
+    )
+
+
+def ball(radius=0.03):
+    """A ball of rings that are fine where it touches the gel, with few faces."""
+    angle = np.radians([*range(0, 27, 2), 60, 120, 180])
+    return from_trimesh(trimesh.creation.revolve(radius * np.stack([np.sin(angle), -np.cos(angle)], -1), sections=32))
 
 
 def from_trimesh(mesh: trimesh.Trimesh, *, color=(0.6, 0.4, 0.3), colors=None) -> Body:

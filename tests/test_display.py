@@ -6,22 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from optics_bodies import noise
 from PIL import Image
 
 import sts_jax as sts
 from sts_jax.storage import DamagedFileError
 
-RNG = np.random.default_rng(0)
-FRAME = sts.Frame(
-    visual=jnp.asarray(RNG.uniform(size=(4, 6, 3)), jnp.float32),
-    tactile=jnp.asarray(RNG.uniform(size=(4, 6, 3)), jnp.float32),
-    depth=jnp.where(jnp.arange(24).reshape(4, 6) < 6, 0.1, jnp.inf),
-    segmentation=jnp.arange(24).reshape(4, 6) < 6,
-    pose=jnp.array([0.0, 0, 0.01, 1, 0, 0, 0]),
-    balanced=jnp.bool_(True),
-    pressure=jnp.asarray(RNG.uniform(0, 2000, size=(5, 5)), jnp.float32),
-    window=jnp.array([-0.1, -0.1, 0.2, 0.2]),
-)
+FRAME = noise((4, 6))
 PREDICTION = sts.Prediction(FRAME.visual, FRAME.tactile, None, jnp.zeros(2), jnp.zeros(2))
 BODY = sts.objects.make(jax.random.key(0), "bottle")
 

@@ -63,27 +63,17 @@ def test_pairs_have_the_measured_values_and_their_copies_turn(data):
             {"shape": (4, 4, 1), "measure": lambda data, rows: np.full((len(rows), 2, 4, 4, 1), 37.0)},
             r"return values in \[0, 1\]",
         ),
-        ({"turn": None}, "'wrench' has no function `turn`, which symmetries=True needs"),
-        ({"turn": lambda values, symmetry: values[:, :1]}, r"`turn` returned an array of shape \(2, 1, 6\)"),
-    ],
-)
-def test_a_wrong_function_of_a_measurement_is_named(data, changes, message):
-    with pytest.raises(ValueError, match=message):
-        data.pairs(np.array([0, 1]), symmetries=True, measurements=(dataclasses.replace(WRENCH, **changes),))
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
         ({"name": "pose"}, "name of a measurement is 'pose'"),
         ({"shape": (4, 4)}, r"shape is \(4, 4\)"),
         ({"scale": 0.0}, "scale is 0.0, but it must be > 0"),
         ({"shape": (32, 32, 3), "scale": 2.0}, "an image needs no scale"),
+        ({"turn": None}, "'wrench' has no function `turn`, which symmetries=True needs"),
+        ({"turn": lambda values, symmetry: values[:, :1]}, r"`turn` returned an array of shape \(2, 1, 6\)"),
     ],
 )
-def test_a_wrong_specification_is_named(fields, message):
+def test_a_wrong_measurement_of_a_dataset_is_named(data, changes, message):
     with pytest.raises(ValueError, match=message):
-        dataset.Measurement(**{"name": "wrench", "shape": (6,), "measure": wrenches, **fields})
+        data.pairs(np.array([0, 1]), symmetries=True, measurements=(dataclasses.replace(WRENCH, **changes),))
 
 
 # ---- Training and prediction. Load 2 follows from load 1, so that the truth is known. The images show nothing.
@@ -236,27 +226,6 @@ def test_measurements_are_scored_against_the_truth_and_the_baselines(predictor):
     np.testing.assert_allclose(filled, 55)  # the first frames were not measured
     with pytest.raises(ValueError, match=r"`inputs` contains 'load', but `test\.measurements` does not: make"):
         evaluation.predict(predictor, ("load",), test._replace(measurements={}), scenario)
-
-
-@pytest.mark.slow
-def test_a_further_image_is_predicted_in_the_unit_interval(tmp_path):
-    """The picture of the heat follows from the load."""
-
-    def heats(data, rows):
-        return np.round(2.55 * np.tile(data[rows][:, None, None, None, None], (1, 2, 32, 32, 1))).astype(np.uint8)
-
-    heat = dataset.Measurement("heat", (32, 32, 1), heats)
-    first = np.random.default_rng(0).uniform(0, 100, 100).astype(np.float32)
-    pairs = pairs_of(first, (LOAD, heat))
-    pairs = pairs._replace(measurements=pairs.measurements | {"heat": heats(first, np.arange(100))})
-    predictor = trained(tmp_path, pairs, (LOAD, heat), steps=200)
-    image = predictor(measurements={"load": np.array([[10.0], [90.0]], np.float32)}).measurements["heat"]
-    assert image.shape == (2, 32, 32, 1)
-    np.testing.assert_allclose(image.mean((1, 2, 3)), [0.1, 0.9], atol=0.1)
-    load = predictor(measurements={"heat": pairs.measurements["heat"][:4, 0] / np.float32(255)}).measurements["load"]
-    np.testing.assert_allclose(load[:, 0], 3 * first[:4] - 20, atol=40)
-    with pytest.raises(ValueError, match="heat has values in"):
-        predictor(measurements={"heat": np.full((32, 32, 1), 255.0, np.float32)})
 
 
 @pytest.mark.slow

@@ -6,35 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from optics_bodies import noise, with_field
 
 import sts_jax as sts
 
 expose = jax.jit(sts.expose)
 SENSOR = sts.Sensor()
-
-
-def with_exposure(value):
-    return dataclasses.replace(SENSOR, room=dataclasses.replace(SENSOR.room, exposure=value))
-
-
-def noise(shape, seed=0):
-    """A frame of random images with black and white pixels."""
-    rng = np.random.default_rng(seed)
-    images = rng.uniform(size=(2, *shape, 3)).astype(np.float32)
-    images[rng.uniform(size=images.shape) < 0.05] = 0
-    images[rng.uniform(size=images.shape) < 0.05] = 1
-    visual, tactile = map(jnp.asarray, images)
-    lead = shape[:-2]
-    return sts.Frame(
-        visual=visual,
-        tactile=tactile,
-        depth=jnp.zeros(shape),
-        segmentation=jnp.zeros(shape, bool),
-        pose=jnp.zeros((*lead, 7)),
-        balanced=jnp.ones(lead, bool),
-        pressure=jnp.zeros((*lead, 3, 3)),
-        window=jnp.zeros((*lead, 4)),
-    )
 
 
 def decode(s):
@@ -47,7 +24,7 @@ def encode(x):
 
 @pytest.mark.parametrize("exposure", [1.0, 6.0])
 def test_light_0_and_1_return_the_streams_exactly_and_a_traced_light_is_clipped(exposure):
-    frame, sensor = noise((97, 53)), with_exposure(exposure)
+    frame, sensor = noise((97, 53)), with_field(SENSOR, "room.exposure", exposure)
     for light, stream in ((0.0, frame.visual), (1.0, frame.tactile)):
         assert np.array_equal(sts.expose(sensor, frame, light), stream)
         assert np.array_equal(expose(sensor, frame, light), stream)
@@ -61,7 +38,7 @@ def test_light_is_added_in_linear_units(exposure):
     frame = noise(shape)
     rng = np.random.default_rng(1)
     for light in (1e-3, 0.2, 0.5, 0.9):
-        image = np.asarray(expose(with_exposure(exposure), frame, light))
+        image = np.asarray(expose(with_field(SENSOR, "room.exposure", exposure), frame, light))
         for i, j, k in zip(*(rng.integers(n, size=200) for n in (*shape, 3)), strict=True):
             seen, felt = float(frame.visual[i, j, k]), float(frame.tactile[i, j, k])
             # The exposure time is `exposure` with the LEDs off, and 1 at full power.
@@ -77,7 +54,9 @@ def test_gradients_equal_finite_differences_and_are_finite_at_0_and_1():
     inner = (frame.visual > 0.1) & (frame.visual < 0.9)
 
     def loss(light, exposure, visual):
-        shown = sts.expose(with_exposure(exposure), dataclasses.replace(frame, visual=visual), light)
+        shown = sts.expose(
+            with_field(SENSOR, "room.exposure", exposure), dataclasses.replace(frame, visual=visual), light
+        )
         return jnp.mean(weights * shown)
 
     value, gradient = jax.jit(loss), jax.jit(jax.grad(loss, argnums=(0, 1, 2)))

@@ -66,6 +66,9 @@ def test_poses_compose_as_matrices_do():
     right, b = poses(200, seed=1)
     np.testing.assert_allclose(geometry.pose_to_matrix(geometry.pose_multiply(left, right)), a @ b, atol=5e-6)
     np.testing.assert_allclose(geometry.pose_to_matrix(geometry.pose_inverse(left)), np.linalg.inv(a), atol=5e-6)
+    points = np.random.default_rng(2).normal(size=(7, 3))
+    got = jax.vmap(geometry.transform, (0, None))(left, jnp.asarray(points))
+    np.testing.assert_allclose(got, points @ a[:, :3, :3].mT + a[:, None, :3, 3], atol=5e-6)
 
 
 def test_quaternion_of_any_matrix_is_the_nearest_rotation():
@@ -78,14 +81,6 @@ def test_quaternion_of_any_matrix_is_the_nearest_rotation():
     values = np.linalg.svd(matrix, compute_uv=False)
     clear = values[:, 1] - values[:, 2] > 0.05  # otherwise two rotations may be equally near
     np.testing.assert_allclose(geometry.quat_to_matrix(quat)[clear], (left @ right)[clear], atol=2e-4)
-
-
-def test_transform_rotates_then_shifts():
-    pose, matrix = poses(5)
-    points = np.random.default_rng(2).normal(size=(7, 3))
-    for one, expected in zip(pose, matrix, strict=True):
-        got = geometry.transform(one, jnp.asarray(points))
-        np.testing.assert_allclose(got, points @ expected[:3, :3].T + expected[:3, 3], atol=2e-6)
 
 
 @pytest.mark.parametrize("vector", [(0.0, 0.0, 0.0), (1e-4, 0.0, -2e-4), (0.3, -1.2, 0.5), (0.0, 3.0, 0.0)])

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from object_files import surface
 
 from sts_jax import objects
 from sts_jax.objects import fill_moments
@@ -42,9 +43,7 @@ def jar(tmp_path_factory) -> tuple[objects.Body, trimesh.Trimesh]:
     path = tmp_path_factory.mktemp("jar") / "jar.stl"
     mesh.export(path)
     body = objects.load(path)
-    faces = np.asarray(body.faces)
-    faces = faces[faces.any(1)]
-    return body, trimesh.Trimesh(np.asarray(body.vertices, float), faces, process=True)
+    return body, surface(body)
 
 
 @pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.3, -0.8, 0.5)])
@@ -113,34 +112,19 @@ def test_stacked_bodies_can_be_mapped_over():
 
 
 def test_a_mirrored_body_is_that_of_the_mirrored_mesh(jar, tmp_path):
-    _, solid = jar
+    body, solid = jar
     other = solid.copy()
     other.vertices *= [1, -1, 1]
     other.invert()  # counter-clockwise from outside again
-    for name, mesh in (("one", solid), ("other", other)):
-        mesh.export(tmp_path / f"{name}.stl")
-    body, truth = (objects.load(tmp_path / f"{name}.stl") for name in ("one", "other"))
-    got = objects.mirror(body)
-    faces = np.asarray(got.faces)
-    assert trimesh.Trimesh(np.asarray(got.vertices, float), faces[faces.any(1)]).volume == pytest.approx(solid.volume)
+    other.export(tmp_path / "other.stl")
+    truth, got = objects.load(tmp_path / "other.stl"), objects.mirror(body)
+    assert surface(got).volume == pytest.approx(solid.volume)
     for a, b in zip(objects.rigid(got, 0.4, 1.1), objects.rigid(truth, 0.4, 1.1), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-7)
     np.testing.assert_allclose(np.ptp(got.hulls[0], 0), np.ptp(truth.hulls[0], 0), rtol=1e-5)
-    corner = np.asarray(got.vertices)[faces[faces.any(1)]]
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    assert (np.einsum("fi,fci->fc", normal, np.asarray(got.normals)[faces.any(1)]) > 0).all()
-    again = objects.mirror(got)
-    for a, b in zip(jax.tree.leaves(body), jax.tree.leaves(again), strict=True):
+    assert (np.einsum("fi,fci->fc", surface(got).face_normals, np.asarray(got.normals)[: len(solid.faces)]) > 0).all()
+    for a, b in zip(jax.tree.leaves(body), jax.tree.leaves(objects.mirror(got)), strict=True):
         np.testing.assert_array_equal(a, b)
-
-
-def twisted() -> trimesh.Trimesh:
-    """Closed, not convex, in no special attitude and away from the origin."""
-    mesh = trimesh.creation.torus(0.03, 0.012, major_sections=24, minor_sections=10)
-    turn = trimesh.transformations.rotation_matrix(0.7, [1.0, 0.4, 0.2])
-    mesh.apply_transform(turn)
-    mesh.apply_translation([0.02, -0.05, 0.04])
-    return mesh
 
 
 def test_fills_of_a_box_are_the_closed_form():
@@ -158,7 +142,9 @@ def test_fills_of_a_box_are_the_closed_form():
 
 
 def test_moments_of_a_solid_and_of_a_surface_agree_with_trimesh():
-    mesh = twisted()
+    mesh = trimesh.creation.torus(0.03, 0.012, major_sections=24, minor_sections=10)
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(0.7, [1.0, 0.4, 0.2]))
+    mesh.apply_translation([0.02, -0.05, 0.04])
     total = solid_moments(mesh.triangles).sum(0)
     np.testing.assert_allclose(total[0], mesh.volume)
     np.testing.assert_allclose(total[1:4] / total[0], mesh.center_mass)

@@ -16,7 +16,6 @@ CAMERA = optics.Camera()
     [
         ((480, 640), (-0.1, -0.075, 0.2, 0.15)),  # the native aspect ratio shows the whole view
         ((64, 64), (-0.075, -0.075, 0.15, 0.15)),  # a square image shows the pad from edge to edge
-        ((100, 50), (-0.0375, -0.075, 0.075, 0.15)),
         ((50, 200), (-0.1, -0.025, 0.2, 0.05)),
     ],
 )

@@ -95,19 +95,6 @@ def test_equilibrium_equals_that_of_a_float64_solver(name):
     check_balance(got.pressure, wrench)
 
 
-@pytest.mark.parametrize("radius", [0.02, 0.04])
-@pytest.mark.parametrize("force", [0.2, 1.0])
-def test_depth_of_a_ball_equals_the_closed_form(radius, force):
-    # F = k * volume of the cap, pi d^2 (3 R - d) / 3
-    x, y = grid()
-    got = settle(GEL, jnp.asarray(ball(x, y, radius), jnp.float32), push(force, 0.01, -0.02))
-    roots = np.roots([-np.pi / 3, np.pi * radius, 0, -force / GEL.stiffness])
-    depth = min(r.real for r in roots if abs(r.imag) < 1e-9 and r.real > 0)
-    assert float(got.sink) == pytest.approx(depth, rel=0.02)
-    imprint = np.asarray(got.pressure) > 0
-    assert imprint.sum() * 1e-6 == pytest.approx(np.pi * (2 * radius * depth - depth**2), rel=0.05)
-
-
 def check_limits(got, height):
     """Assert that a result is within the gel's limits of pressure, tilt and depth."""
     x, y = grid()

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from tactile_surfaces import SHAPES, bumpy, normals_of, some_pixels
 
-from sts_jax import tactile
 from sts_jax.tactile.normals import smallest_eigenvector
 
 pytestmark = pytest.mark.usefixtures("strict_ranks")
@@ -74,12 +73,3 @@ def test_normals_equal_the_axis_of_least_covariance(shape):
         normal = np.linalg.eigh(np.cov(around.T, bias=True))[1][:, 0]
         normal *= -np.sign(normal[2])
         np.testing.assert_allclose(got[i, j], normal, atol=2e-3)
-
-
-def test_normals_of_stacked_grids_equal_those_of_each_grid():
-    grids = [np.moveaxis(bumpy((9, 7)), -1, 0), np.moveaxis(bumpy((9, 7))[::-1], -1, 0)]
-    several = tactile.surface_normals(tuple(jnp.asarray(np.stack(planes, -1)) for planes in zip(*grids, strict=True)))
-    assert several.shape == (7, 5, 2, 3)
-    for k, grid in enumerate(grids):
-        alone = tactile.surface_normals(tuple(jnp.asarray(grid)))
-        np.testing.assert_allclose(several[:, :, k], alone, atol=1e-6)

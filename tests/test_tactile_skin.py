@@ -159,24 +159,6 @@ def test_shadows_equal_a_float64_loop(shape, lights):
         np.testing.assert_allclose(got[:, i, j], list(arriving(SKIN, lights, depth, i, j)), atol=5e-3)
 
 
-@pytest.mark.parametrize("near", [False, True])
-def test_length_of_a_shadow_equals_height_over_tangent(near):
-    shape, height, tangent = (24, 400), 0.002, 0.2
-    x = 1e-4 * (np.arange(shape[1]) + 0.5)
-    depth = np.tile(np.where(np.abs(x - 0.01) < 0.001, height, 0), (shape[0], 1))
-    direction = jnp.array([[-1.0, 0, -tangent]])
-    lights = tactile.Leds(positions=2 * direction, colors=jnp.ones((1, 3))) if near else None
-    lights = lights or tactile.Lights(directions=direction, colors=jnp.ones((1, 3)))
-    skin = tactile.Skin(shadow_steps=400, shadow_reach=0.03, penumbra=0.001)
-    window = jnp.array([0.0, -0.0012, 0.04, 0.0024])
-    share = np.asarray(jax.jit(tactile.shadows)(skin, lights, jnp.asarray(depth, jnp.float32), window))[0, 12]
-    dark = x[(share < 0.5) & (depth[0] == 0)]
-    assert dark.min() == pytest.approx(0.011, abs=2e-4)
-    assert dark.max() == pytest.approx(0.011 + height / tangent, abs=3e-4)
-    assert np.all(share[x < 0.009] == 1)
-    assert np.all(share[x > 0.0215] == 1)
-
-
 def test_zero_steps_and_flat_skin_give_no_shadows():
     depth, window = jnp.asarray(pressed((20, 30)), jnp.float32), jnp.asarray(WINDOW, jnp.float32)
     for lights in (tactile.Lights(), LEDS):
