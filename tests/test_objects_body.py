@@ -70,23 +70,20 @@ def test_repr_describes_a_body_in_one_line_also_while_traced(jar):
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("name", "value", "message"),
     [
-        ({"colors": np.nan}, r"colors has values that are not finite \(9,216 of 9,216\)"),
-        ({"shell_mass": np.inf}, "shell_mass is inf, but all values must be finite"),
-        ({"faces": 1024}, "faces has indices from 1024 to 1024, but with 1024 vertices"),
-        ({"category": 8}, r"category is 8, but it must be -1 .* or an index into objects.CATEGORIES \(0 to 7\)"),
+        ("colors", np.nan, r"colors has values that are not finite \(9,216 of 9,216\)"),
+        ("shell_mass", np.inf, "shell_mass is inf, but all values must be finite"),
+        ("faces", 1024, "faces has indices from 1024 to 1024, but with 1024 vertices"),
+        ("category", 8, r"category is 8, but it must be -1 .* or an index into objects.CATEGORIES \(0 to 7\)"),
     ],
 )
-def test_check_refuses_an_invalid_body_and_names_the_field(changes, message):
+def test_check_refuses_an_invalid_body_and_names_the_field(name, value, message):
     body = objects.make(jax.random.key(0), "fork")
     body.check()
-    changes = {name: jnp.full_like(getattr(body, name), value) for name, value in changes.items()}
     with pytest.raises(ValueError, match=message):
-        dataclasses.replace(body, **changes).check()
-    with pytest.raises(
-        ValueError, match=r"vertices has the shape \(2, 1024, 3\), but it must be \(v, 3\): use jax.vmap for"
-    ):
+        dataclasses.replace(body, **{name: jnp.full_like(getattr(body, name), value)}).check()
+    with pytest.raises(ValueError, match=r"shape \(2, 1024, 3\), but it must be \(v, 3\): use jax.vmap for"):
         objects.stack([body, body]).check()
 
 

@@ -143,24 +143,3 @@ def test_faces_from_behind_and_with_a_vertex_that_is_not_kept_are_not_drawn():
     assert nearest(keep) == 2
     assert nearest(keep.at[7].set(False)) == 1
     assert nearest(keep.at[jnp.array([7, 3])].set(False)) == 0
-
-
-def test_near_faces_have_an_image_of_their_own():
-    body = BODIES["ring"]
-    points = geometry.transform(some_pose(np.random.default_rng(7)), body.vertices)
-    faces, height = np.asarray(body.faces), np.asarray(points[:, 2])
-    real = np.any(faces != faces[:, :1], axis=1)
-    within = float(np.median(height[faces].min(1)[real]))
-    near = real & (height[faces].min(1) < within)
-    assert near.sum() > 50
-    assert (real & ~near).sum() > 50
-    drawn = jax.jit(optics.rasterise, static_argnames="shape")
-    places, keep = (points[:, :2] + 0.075) * 1000, jnp.ones(len(points), bool)
-
-    def alone(faces):
-        return drawn(places, points[:, 2], jnp.asarray(faces), keep, jnp.bool_(True), shape=(150, 150))
-
-    both = drawn(places, points[:, 2], body.faces, keep, jnp.bool_(True), shape=(150, 150), within=within)
-    assert np.any(np.asarray(both[0]) != np.asarray(both[1]))
-    np.testing.assert_array_equal(both[0], alone(np.where(near[:, None], faces, faces[:, :1])))
-    np.testing.assert_array_equal(both[1], alone(faces))

@@ -26,13 +26,6 @@ def test_bilinear_equals_scipy_also_beyond_the_image(wrap, mode):
     np.testing.assert_allclose(one, found[..., 0], atol=1e-6)
 
 
-def test_bilinear_at_pixel_centres_returns_the_pixels():
-    column, row = np.meshgrid(np.arange(9.0), np.arange(7.0))
-    for wrap in (False, True):
-        found = _sampling.bilinear(jnp.asarray(IMAGE), jnp.float32(column), jnp.float32(row), wrap=wrap)
-        np.testing.assert_array_equal(found, IMAGE)
-
-
 def test_bilinear_batch_equals_scipy_for_each_image():
     images = np.stack([IMAGE, IMAGE[::-1]])
     column, row = COLUMN.reshape(2, -1), ROW.reshape(2, -1)
