@@ -93,22 +93,6 @@ def test_tilt_of_the_balanced_pose_matches_its_pressure():
     assert plane[0] < 0 < plane[1]  # deeper towards the centre of pressure
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("crop", [False, True])
-def test_images_are_empty_after_an_object_has_fallen_off(crop):
-    resolution = (97, 53)
-    gone = sense(SENSOR, ball(), at(0.12, 0.0, -0.08), weight(0, 0, 0), resolution=resolution, crop=crop)
-    far = sense(SENSOR, ball(), at(5.0, 0.0, 0.1), weight(0, 0, 0), resolution=resolution, crop=crop)
-    assert not np.any(gone.segmentation)
-    assert np.all(np.isinf(gone.depth))
-    for name in ("visual", "tactile", "window"):
-        assert np.array_equal(getattr(gone, name), getattr(far, name))
-    assert np.array_equal(
-        np.round(np.asarray(gone.tactile)[20:-20, 20:-20] * 255),
-        np.broadcast_to([178, 178, 204], (resolution[0] - 40, resolution[1] - 40, 3)),
-    )
-
-
 def test_a_hovering_object_is_visible_and_leaves_no_imprint():
     frame = sense(SENSOR, ball(), at(0.01, 0.0, 0.05), weight(0, 0, 0))
     assert np.any(frame.segmentation)

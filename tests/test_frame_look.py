@@ -17,41 +17,18 @@ from sts_jax import objects, sense
 SENSOR = sts.Sensor()
 
 
-@pytest.mark.parametrize("resolution", [(64, 64), pytest.param((97, 53), marks=pytest.mark.slow)])
-def test_an_object_on_the_pad_darkens_the_skin_around_it(resolution):
+def test_an_object_on_the_pad_darkens_the_skin_around_it():
     body = from_trimesh(trimesh.creation.cylinder(radius=0.015, height=0.06))
-    empty = np.asarray(sense(SENSOR, body, at(0, 0, -1.0), resolution=resolution).visual)
-    there = sense(SENSOR, body, at(0, 0, 0.03), resolution=resolution)
+    empty = np.asarray(sense(SENSOR, body, at(0, 0, -1.0)).visual)
+    there = sense(SENSOR, body, at(0, 0, 0.03))
     share = np.asarray(there.visual).mean(-1) / empty.mean(-1)
-    height, width = resolution
-    left, top, wide, tall = np.asarray(there.window)
-    x = left + (np.arange(width) + 0.5) / width * wide
-    y = top + (np.arange(height) + 0.5) / height * tall
-    away = np.hypot(x[None, :], y[:, None])
+    x = 0.15 * ((np.arange(64) + 0.5) / 64 - 0.5)
+    away = np.where(there.segmentation, 0, np.hypot(x[None, :], x[:, None]))
     # The wall of the cylinder hides nearly half of the sky beside it. 3 % in sRGB is about 7 % of the light.
-    ring = (away > 0.016) & (away < 0.02) & ~np.asarray(there.segmentation)
-    if ring.any():
-        assert 0.9 < share[ring].mean() < 0.97
-    assert np.all(share[(away > 0.06) & ~np.asarray(there.segmentation)] > 0.985)
-    in_air = np.asarray(sense(SENSOR, body, at(0, 0, 0.13), resolution=resolution).visual).mean(-1) / empty.mean(-1)
+    assert 0.9 < share[(away > 0.016) & (away < 0.02)].mean() < 0.97
+    assert np.all(share[away > 0.06] > 0.985)
+    in_air = np.asarray(sense(SENSOR, body, at(0, 0, 0.13)).visual).mean(-1) / empty.mean(-1)
     assert in_air[(away > 0.03) & (away < 0.035)].min() > 0.96
-
-
-@pytest.mark.slow
-def test_the_view_beyond_the_pad_is_a_dark_housing_also_behind_an_object():
-    body = from_trimesh(trimesh.creation.box((0.05, 0.04, 0.03)), color=(0.9, 0.9, 0.1))
-    gone = sense(SENSOR, body, at(0, 0, -1.0), resolution=(96, 128))
-    over = sense(SENSOR, body, at(0.07, 0, 0.015), resolution=(96, 128))
-    beyond = np.abs(0.2 * ((np.arange(128) + 0.5) / 128 - 0.5)) > 0.076
-    assert beyond.sum() == 30
-    assert np.asarray(over.segmentation)[:, beyond].any()  # segmentation ignores the housing
-    for stream in ("visual", "tactile"):
-        image = np.asarray(getattr(gone, stream))
-        # The overhanging object casts a faint shadow at most.
-        np.testing.assert_allclose(np.asarray(getattr(over, stream))[:, beyond], image[:, beyond], atol=0.04)
-        assert image[:, beyond].max() < 0.35 * image[:, 64].max()
-        inwards = image[48, :15].mean(-1)
-        assert np.all(np.diff(inwards) > 0)  # brightest just below the pad's edge
 
 
 @pytest.mark.slow
