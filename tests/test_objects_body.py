@@ -109,12 +109,14 @@ def test_stacked_bodies_can_be_mapped_over():
 
 
 def test_a_mirrored_body_is_that_of_the_mirrored_mesh(jar, tmp_path):
-    body, solid = jar
+    _, solid = jar
     other = solid.copy()
     other.vertices *= [1, -1, 1]
     other.invert()  # counter-clockwise from outside again
-    other.export(tmp_path / "other.stl")
-    truth, got = objects.load(tmp_path / "other.stl"), objects.mirror(body)
+    for name, mesh in (("one", solid), ("other", other)):
+        mesh.export(tmp_path / f"{name}.stl")
+    body, truth = (objects.load(tmp_path / f"{name}.stl") for name in ("one", "other"))
+    got = objects.mirror(body)
     assert surface(got).volume == pytest.approx(solid.volume)
     for a, b in zip(objects.rigid(got, 0.4, 1.1), objects.rigid(truth, 0.4, 1.1), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-7)
