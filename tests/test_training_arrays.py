@@ -72,16 +72,6 @@ def test_image_arrays_are_first_inputs_and_last_targets_and_mask_first_touches_w
     assert alone.present == {}
 
 
-@pytest.mark.parametrize(
-    ("modalities", "resolution", "message"),
-    [(("visual", "pose"), (64, 64), "modalities must be one or both of"), (("visual",), (32, 32), "resize the images")],
-)
-def test_image_arrays_refuse_poses_and_other_shapes(modalities, resolution, message):
-    images, blank = np.zeros((3, 2, 64, 64, 3), np.uint8), np.zeros((64, 64, 3), np.uint8)
-    with pytest.raises(ValueError, match=message):
-        training.image_arrays(images, images, modalities, training.Preprocessing(resolution), blank)
-
-
 EMPTY = np.clip(drawn(None, None) + np.arange(64)[:, None, None], 0, 255).astype(np.uint8)  # light that varies
 
 
@@ -108,3 +98,5 @@ def test_invalid_shapes_and_shifts_are_refused():
         training.shifted(images, EMPTY, np.array([[64, 0]]))
     with pytest.raises(TypeCheckError, match="shifts"):
         training.shifted(images, EMPTY, np.array([[1, 0], [2, 0]]))
+    with pytest.raises(ValueError, match=r"resize them to \(32, 32\)"):
+        training.image_arrays(images, images, ("visual",), training.Preprocessing((32, 32)), EMPTY)

@@ -44,14 +44,7 @@ def test_a_killed_run_ends_with_the_same_bits(tmp_path, finished, step):
     same(model.state, finished[1].state)
     for name in ("metrics.jsonl", "config.json"):
         assert (tmp_path / name).read_text() == (finished[0] / name).read_text()
-    assert [json.loads(line)["step"] for line in (tmp_path / "metrics.jsonl").read_text().splitlines()] == [
-        2,
-        4,
-        6,
-        8,
-        10,
-        12,
-    ]
+    assert [json.loads(line)["step"] for line in (tmp_path / "metrics.jsonl").open()] == [2, 4, 6, 8, 10, 12]
 
 
 def test_a_finished_run_is_not_changed(finished):
@@ -96,24 +89,6 @@ def test_beta_warms_up_over_its_share_of_the_steps():
         terms = parts(state._replace(step=jnp.int32(step)), batch)
         rest = sum(subsets * terms[name] for name in SMALL.names)
         np.testing.assert_allclose(terms["loss"], rest + beta * subsets * terms["kl"], rtol=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"absent": ("b",)}, r"`absent` contains 'b', .* and \d+ samples have b"),
-        ({"absent": ("c",)}, r"`absent` contains 'c', but the model has the modalities \['a', 'b'\]"),
-        ({"inputs": {"a": np.zeros((20, 3), np.float32)}}, "`inputs` has"),
-        ({"present": {"sound": np.ones(20, bool)}}, "`present` has masks"),
-        ({"targets": {"a": np.zeros((20, 3), np.float32), "b": np.zeros((20, 5), np.float32)}}, "samples of `targets`"),
-    ],
-)
-def test_arrays_that_do_not_fit_are_named(change, message):
-    data, absent = arrays(), change.get("absent", ())
-    fields = {"inputs": data.inputs, "targets": data.targets, "present": data.present} | change
-    fields.pop("absent", None)
-    with pytest.raises(ValueError, match=message):
-        training.learner(SMALL, absent=absent).check(training.Arrays(**fields))
 
 
 def test_a_loss_that_is_not_finite_ends_the_run(tmp_path):
@@ -212,21 +187,12 @@ def test_a_killed_run_of_a_state_space_model_ends_with_the_same_bits(tmp_path):
     loaded = training.load(tmp_path / "killed")
     same(loaded.state, whole.state)
     assert (loaded.config, loaded.graphdef, loaded.step) == (STATE, whole.graphdef, 6)
-    assert loaded.settings["kind"] == "statespace"
 
 
 @pytest.mark.slow
 def test_a_state_space_model_memorises_four_samples(tmp_path):
-    config = training.TrainConfig(
-        steps=800,
-        batch_size=4,
-        learning_rate=4e-3,
-        schedule="cosine",
-        b2=0.99,
-        clip=200.0,
-        log_every=50,
-        checkpoint_every=800,
-    )
+    rate = {"learning_rate": 4e-3, "schedule": "cosine", "b2": 0.99, "clip": 200.0}
+    config = training.TrainConfig(steps=800, batch_size=4, log_every=50, checkpoint_every=800, **rate)
     training.train(config, STATE, bars(), workdir=tmp_path)
     log = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     first, last = log[0], log[-1]
@@ -243,32 +209,24 @@ ONES = np.ones(4, np.float32)
 @pytest.mark.parametrize(
     ("field", "change", "message"),
     [
-        ("views", {"visual": lambda x: x[:, :8]}, "`views` has the shapes"),
-        ("views", {"state": lambda x: x[:2]}, "`views` has the shapes"),
-        ("falls", {"pose": lambda x: x[:, :7]}, "`falls` has the shapes"),
-        ("falls", {"outcome": lambda x: x + 2}, "`outcome` must be integers from 0 to 1, got int32 from 2 to 3"),
-        ("targets", {"outcome": lambda _: ONES}, "`outcome` must be integers from 0 to 1, got float32"),
-        ("targets", {"pose": lambda x: x[:, :7]}, "`targets` has the shapes"),
-        ("inputs", {"visual": lambda x: x[:, :8]}, "`inputs` has the shapes"),
-        ("empty", {"visual": lambda x: x[:8]}, r"`empty` has .* of shape \(16, 16, 3\)"),
-        ("present", {"tactile": lambda _: ONES > 0}, r"`present` may have masks for .* got \['tactile'\] and \[\]"),
-        (
-            "target_present",
-            {"tactile": lambda _: ONES > 0},
-            r"`target_present` for nothing, got \[\] and \['t",
-        ),
+        ("inputs", lambda x: x | {"visual": x["visual"][:, :8]}, "samples of `inputs` have the shapes"),
+        ("targets", lambda x: x | {"pose": x["pose"][:, :7]}, "samples of `targets` have the shapes"),
+        ("targets", lambda x: x | {"outcome": x["outcome"] + 1}, "`outcome` has the index 2, but the model has 2"),
+        ("present", lambda _: {"sound": ONES > 0}, r"`present` has masks for \['sound'\]"),
         ("condition", lambda _: ONES[:, None], "`condition` has width 1, but the model has condition=0"),
+        ("views", lambda x: x | {"state": x["state"][:2]}, "must have the same number of samples"),
     ],
 )
-def test_arrays_that_do_not_fit_a_state_space_model_are_named(field, change, message):
+def test_arrays_that_do_not_fit_are_named(field, change, message):
     data = bars(further=True)
-    values = getattr(data, field)
-    if callable(change):
-        changed = change(values)
-    else:
-        changed = values | {name: make(values.get(name)) for name, make in change.items()}
     with pytest.raises(ValueError, match=message):
-        training.learner(STATE).check(dataclasses.replace(data, **{field: changed}))
+        training.learner(STATE).check(dataclasses.replace(data, **{field: change(getattr(data, field))}))
+
+
+def test_an_absent_modality_is_no_input():
+    training.learner(SMALL).check(arrays())
+    with pytest.raises(ValueError, match="`inputs` have the shapes .* but the model needs {'a'"):
+        training.learner(SMALL, absent=("b",)).check(arrays())
 
 
 # ---- Options and the default optimiser
@@ -291,7 +249,7 @@ def test_a_gradient_far_below_its_epsilon_moves_an_encoder_little_and_a_decoder_
         ({"learning_rate": float("nan")}, "learning_rate must be finite, got nan"),
         ({"b2": 1.0}, r"b2 must be < 1\.0000, got 1\.0"),
         ({"log_every": 3, "checkpoint_every": 4}, r"checkpoint_every must be a multiple of log_every \(3\), got 4"),
-        ({"schedule": "cosine", "warmup": 10}, r"warmup must be smaller than the number of steps .* \(10\), got 10"),
+        ({"schedule": "cosine", "warmup": 10}, r"warmup must be smaller than the number of steps \(10\)"),
     ],
 )
 def test_an_option_out_of_range_is_refused(fields, message):

@@ -1,21 +1,21 @@
 """Training of `sts_jax.statespace` and `sts_jax.mvae` models: training arrays, the training loop and model folders."""
 
-from sts_jax.training.arrays import Arrays, order
-from sts_jax.training.config import TrainConfig, optimiser
-from sts_jax.training.folder import TrainState, load_blank, records, restore, save, save_blank, save_calibration
-from sts_jax.training.learners import Learner, Loss, learner
-from sts_jax.training.loop import initial, step, train
-from sts_jax.training.model import Model, calibrate, load
-from sts_jax.training.preprocess import Preprocessing, touch_of_noisy_images
-from sts_jax.training.trajectories import (
+from sts_jax.training.arrays import (
+    Arrays,
     frame_arrays,
     image_arrays,
+    order,
     paper_model,
     shifted,
     state_arrays,
     state_codes,
     state_model,
 )
+from sts_jax.training.config import TrainConfig, optimiser
+from sts_jax.training.folder import TrainState, load_blank, records, restore, save, save_blank, save_calibration
+from sts_jax.training.loop import Learner, Loss, initial, learner, step, train
+from sts_jax.training.model import Model, calibrate, load
+from sts_jax.training.preprocess import Preprocessing, touch_of_noisy_images
 
 __all__ = [
     "Arrays",

@@ -1,22 +1,32 @@
-"""A training set in memory, its batches, and the order of the samples."""
+"""Training arrays in memory: their batches, how they are made, and the model configurations that fit them."""
 
+import dataclasses
+import functools
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int, UInt8
+
+from sts_jax import mvae, optics, physics, statespace
+from sts_jax._checked import checked
+from sts_jax.dataset import Ends, Measurement, Pairs, Views, reduced_images
+from sts_jax.sensor import Sensor
+from sts_jax.training.preprocess import Preprocessing
 
 Batch = dict[str, Any]  # the fields of `Arrays` by name, with the samples of one batch
+Config = mvae.Config | statespace.Config  # configuration of a model of either kind
+
+_CHUNK = 512  # number of items that are encoded at once
 
 
 @dataclass(frozen=True)
 class Arrays:
-    """A training set in memory.
-
-    The first axis of all arrays is the sample. Images are uint8, or float32 in [0, 1].
-    """
+    """A training set in memory. The first axis of all arrays is the sample. Images are uint8, or float32 in [0, 1]."""
 
     inputs: dict[str, np.ndarray]  # inputs of the model, from first frames
     # Targets of the model, from last frames. A state-space model also needs the state codes `state` of the first
@@ -26,19 +36,19 @@ class Arrays:
     present: dict[str, np.ndarray] = field(default_factory=dict)
     target_present: dict[str, np.ndarray] = field(default_factory=dict)  # the same for targets, for `mvae` models only
     condition: np.ndarray | None = None  # (samples, condition), encoded condition of the scenario
-    # For state-space models: `visual` and `tactile` image of the empty sensor, (size, size, 3)
+    # The other fields are for state-space models. `visual` and `tactile` image of the empty sensor, (size, size, 3)
     empty: dict[str, np.ndarray] = field(default_factory=dict)
-    # For state-space models: first frames without a trajectory, as `visual` and `state`, (views, *shape)
+    # First frames without a trajectory, as `visual` and `state`, (views, *shape)
     views: dict[str, np.ndarray] = field(default_factory=dict)
-    # For state-space models: trajectories without images, as `state`, `pose`, `outcome` and, if the model has a
-    # condition, `condition`, (falls, *shape)
+    # Trajectories without images, as `state`, `pose`, `outcome` and any `condition`, (falls, *shape)
     falls: dict[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        leaves = jax.tree_util.tree_leaves_with_path(self._tree())
-        lengths = {jax.tree_util.keystr(path, simple=True, separator="/"): len(x) for path, x in leaves}
-        if len(set(lengths.values())) != 1 or 0 in lengths.values():
-            raise ValueError(f"all arrays must have the same number of samples, at least 1, got the lengths {lengths}")
+        for group in (self._tree(), self.views, self.falls):
+            leaves = jax.tree_util.tree_leaves_with_path(group)
+            lengths = {jax.tree_util.keystr(path, simple=True, separator="/"): len(x) for path, x in leaves}
+            if len(set(lengths.values())) > 1 or 0 in lengths.values():
+                raise ValueError(f"arrays must have the same number of samples, at least 1, got the lengths {lengths}")
 
     def __len__(self) -> int:
         return len(next(iter(self.targets.values())))
@@ -67,17 +77,10 @@ class Arrays:
 
 
 def order(seed: int, samples: int, batch_size: int, start: int, stop: int) -> Iterator[np.ndarray]:
-    """Iterate over the batches of a training, each as an array of sample indices `(batch_size,)`.
+    """Iterate over the batches `start` to `stop` - 1 of a training, each as sample indices `(batch_size,)`.
 
     Each epoch is a random permutation of all samples. A batch may contain the end of one epoch and the start of the
     next. The samples in batch k do not depend on `start` and `stop`, so that a resumed training uses the same batches.
-
-    Args:
-        seed: Seed of the permutations.
-        samples: Number of samples.
-        batch_size: Number of samples in a batch.
-        start: Number of the first batch, counted from 0.
-        stop: Number of the last batch, plus 1.
     """
     permutations: dict[int, np.ndarray] = {}
     for number in range(start, stop):
@@ -86,3 +89,302 @@ def order(seed: int, samples: int, batch_size: int, start: int, stop: int) -> It
             e: permutations.get(e, np.random.default_rng([seed, e]).permutation(samples)) for e in np.unique(epoch)
         }
         yield np.array([permutations[e][p] for e, p in zip(epoch, place, strict=True)])
+
+
+def check(model: Config, arrays: Arrays, absent: tuple[str, ...] = ()) -> None:
+    """Raise a ValueError if a training set does not fit a model."""
+    if isinstance(model, mvae.Config):
+        targets = {modality.name: modality.shape for modality in model.modalities}
+        inputs = {name: shape for name, shape in targets.items() if name not in absent}
+    else:
+        code, size = (statespace.POSE_CODE,), (model.input_size, model.input_size, 3)
+        inputs = {name: code if name == "pose" else size for name in model.inputs}
+        targets = dict.fromkeys(statespace.IMAGES, (model.image_size, model.image_size, 3))
+        targets |= {"state": (statespace.STATE_CODE,), "pose": code, "outcome": ()}
+    for kind, shapes, values in (("inputs", inputs, arrays.inputs), ("targets", targets, arrays.targets)):
+        actual = {name: x.shape[1:] for name, x in values.items()}
+        if actual != shapes:
+            raise ValueError(f"the samples of `{kind}` have the shapes {actual}, but the model needs {shapes}")
+    if isinstance(model, statespace.Config) and (highest := arrays.targets["outcome"].max()) >= model.outcomes:
+        raise ValueError(f"`outcome` has the index {highest}, but the model has {model.outcomes} outcomes")
+    if not set(arrays.present) <= set(inputs):
+        raise ValueError(f"`present` has masks for {list(arrays.present)}, but the inputs are {list(inputs)}")
+    width = 0 if arrays.condition is None else arrays.condition.shape[1]
+    if width != model.condition:
+        raise ValueError(f"`condition` has width {width}, but the model has condition={model.condition}")
+
+
+def frame_arrays(
+    pairs: Pairs,
+    modalities: tuple[str, ...],
+    preprocessing: Preprocessing,
+    blank: np.ndarray,
+    *,
+    measurements: Sequence[Measurement] = (),
+) -> tuple[Arrays, Preprocessing]:
+    """Make the training arrays of an `mvae` model: inputs from first frames, targets from last frames.
+
+    Args:
+        pairs: From `dataset.Dataset.pairs`.
+        modalities: Modalities of the model, some of `visual`, `tactile` and `pose`.
+        preprocessing: Encodes poses and conditions. A trajectory without a contact in its first frame, see
+            `Preprocessing.touched`, gives a sample without the input `tactile`.
+        blank: Tactile image of the empty sensor, uint8 `(height, width, 3)`, from `dataset.empty_frame`.
+        measurements: Further modalities of the model. `pairs.measurements` must have their values.
+
+    Returns:
+        The arrays, and the preprocessing with new values of `absent` (the modalities that no first frame has, which
+        `arrays.inputs` omits) and `scales` (of the measurements that are vectors).
+    """
+    further = tuple(measurement.name for measurement in measurements)
+    if lacking := set(further) - set(pairs.measurements):
+        raise ValueError(f"pairs.measurements lacks {lacking}: pass the same `measurements` to Dataset.pairs")
+    scales = tuple((m.name, float(m.scale)) for m in measurements if not m.is_image)
+    preprocessing = dataclasses.replace(preprocessing, scales=scales)
+    code = np.asarray(_pose_codes(preprocessing, pairs.pose))
+    frames = {"visual": pairs.visual, "tactile": pairs.tactile, "pose": code}
+    for m in measurements:
+        values = pairs.measurements[m.name]
+        frames[m.name] = values if m.is_image else np.asarray(preprocessing.encode(m.name, jnp.asarray(values)))
+    condition = np.asarray(preprocessing.encode_condition(jnp.asarray(pairs.condition)))
+    return _arrays(frames, modalities, preprocessing, blank, condition if condition.shape[1] else None, further)
+
+
+@checked
+def image_arrays(
+    visual: UInt8[np.ndarray, "n 2 h w 3"],
+    tactile: UInt8[np.ndarray, "n 2 h w 3"],
+    modalities: tuple[str, ...],
+    preprocessing: Preprocessing,
+    blank: UInt8[np.ndarray, "h w 3"],
+) -> tuple[Arrays, Preprocessing]:
+    """Make the training arrays of an `mvae` model from images without poses, as from a real sensor.
+
+    Args:
+        visual: First and last visual images, for example from `hardware.Recordings.images`.
+        tactile: First and last tactile images.
+        modalities: Modalities of the model, one or both of `visual` and `tactile`.
+        preprocessing: Detects contacts. For images of a camera, from `touch_of_noisy_images`.
+        blank: Tactile image of the empty sensor.
+
+    Returns:
+        The arrays, and the preprocessing with a new value of `absent`, as from `frame_arrays`.
+    """
+    if blank.shape[:2] != preprocessing.resolution:
+        raise ValueError(f"the images have {blank.shape[:2]} pixels: resize them to {preprocessing.resolution}")
+    return _arrays({"visual": visual, "tactile": tactile}, modalities, preprocessing, blank, None)
+
+
+def _arrays(
+    frames: dict[str, np.ndarray],
+    modalities: tuple[str, ...],
+    preprocessing: Preprocessing,
+    blank: np.ndarray,
+    condition: np.ndarray | None,
+    further: tuple[str, ...] = (),
+) -> tuple[Arrays, Preprocessing]:
+    # NaN marks frames in which a further modality was not measured.
+    measured = {name: ~np.isnan(frames[name]).reshape(*frames[name].shape[:2], -1).any(-1) for name in further}
+    present = {name: mask[:, 0] for name, mask in measured.items() if not mask[:, 0].all()}
+    if "tactile" in modalities:
+        present["tactile"] = _touched(frames["tactile"], preprocessing, blank)
+    absent = tuple(name for name, mask in present.items() if not mask.any())
+    names = (*modalities, *further)
+    arrays = Arrays(
+        inputs={name: np.ascontiguousarray(frames[name][:, 0]) for name in names if name not in absent},
+        targets={name: np.ascontiguousarray(frames[name][:, 1]) for name in names},
+        present={name: mask for name, mask in present.items() if name not in absent},
+        target_present={name: mask[:, 1] for name, mask in measured.items() if not mask[:, 1].all()},
+        condition=condition,
+    )
+    return arrays, dataclasses.replace(preprocessing, absent=absent)
+
+
+def paper_model(
+    modalities: tuple[str, ...], preprocessing: Preprocessing, *, measurements: Sequence[Measurement] = ()
+) -> mvae.Config:
+    """Make the configuration of the networks in the See-Through-your-Skin paper. Arguments as for `frame_arrays`.
+
+    The weight of the reconstruction error is 1 for images, 1000 for the pose, and `Measurement.weight` otherwise.
+    """
+    shape = (*preprocessing.resolution, 3)
+    standard = {name: mvae.Modality(name, "image", shape, start=0.7) for name in ("visual", "tactile")}
+    standard["pose"] = mvae.Modality("pose", "vector", (preprocessing.pose_size,), weight=1000.0)
+    further = [
+        mvae.Modality(m.name, "image" if m.is_image else "vector", m.shape, weight=float(m.weight))
+        for m in measurements
+    ]
+    chosen = [standard[name] for name in modalities]
+    return mvae.Config((*chosen, *further), condition=len(preprocessing.condition_scale))
+
+
+def state_arrays(
+    pairs: Pairs,
+    model: statespace.Config,
+    scenario: physics.Scenario,
+    preprocessing: Preprocessing,
+    empty: dict[str, np.ndarray],
+    *,
+    views: Views | None = None,
+    falls: Ends | None = None,
+) -> Arrays:
+    """Make the training arrays of a state-space model.
+
+    Args:
+        pairs: From `dataset.Dataset.pairs`, with images of `model.input_size` pixels on each side.
+        model: From `state_model`.
+        scenario: Scenario of the trajectories.
+        preprocessing: Encodes poses and conditions, and detects contacts.
+        empty: `visual` and `tactile` image of the empty sensor, uint8, from `dataset.empty_frame`.
+        views: From `dataset.Dataset.views`. They are used only if `visual` is an input of the model.
+        falls: Further trajectories without images, from `dataset.Dataset.ends`.
+    """
+    code = np.asarray(_pose_codes(preprocessing, pairs.pose))
+    last = reduced_images({"visual": pairs.visual[:, 1], "tactile": pairs.tactile[:, 1]}, model.image_size)
+    ends = _ends(pairs, code[:, 1], scenario, preprocessing)
+    inputs = {"visual": pairs.visual[:, 0], "tactile": pairs.tactile[:, 0], "pose": code[:, 0]}
+    touched = {"tactile": _touched(pairs.tactile, preprocessing, empty["tactile"])} if "tactile" in model.inputs else {}
+    view_arrays, fall_arrays = {}, {}
+    if views is not None and len(views.pose) and "visual" in model.inputs:
+        state = state_codes(preprocessing, views.pose, views.support, views.mass, views.com)
+        view_arrays = {"visual": views.visual, "state": state}
+    if falls is not None and len(falls.pose):
+        fall_arrays = _ends(falls, np.asarray(_pose_codes(preprocessing, falls.pose[:, 1])), scenario, preprocessing)
+    return Arrays(
+        inputs={name: np.ascontiguousarray(inputs[name]) for name in model.inputs},
+        condition=ends.pop("condition", None),
+        targets=last | ends,
+        present=touched,
+        empty=empty,
+        views=view_arrays,
+        falls=fall_arrays,
+    )
+
+
+def _ends(
+    ends: Pairs | Ends, final_pose: np.ndarray, scenario: physics.Scenario, preprocessing: Preprocessing
+) -> dict[str, np.ndarray]:
+    """Codes of the first states, final pose codes, indices into `scenario.outcomes` and any encoded conditions."""
+    numbers = np.array([int(outcome) for outcome in scenario.outcomes])
+    if not np.isin(ends.outcome, numbers).all():
+        raise ValueError(
+            f"the trajectories have the outcomes {np.unique(ends.outcome).tolist()}, but the scenario "
+            f"{type(scenario).__name__} has the outcomes {numbers.tolist()}: give the scenario of the dataset"
+        )
+    condition = np.asarray(preprocessing.encode_condition(jnp.asarray(ends.condition)))
+    return {
+        "state": state_codes(preprocessing, ends.pose[:, 0], ends.support, ends.mass, ends.com),
+        "pose": final_pose,
+        "outcome": (ends.outcome[:, None] == numbers).argmax(1).astype(np.int32),
+        **({"condition": condition} if condition.shape[1] else {}),
+    }
+
+
+def state_codes(
+    preprocessing: Preprocessing, pose: np.ndarray, support: np.ndarray, mass: np.ndarray, com: np.ndarray
+) -> np.ndarray:
+    """Encode the true states of n objects as state codes `(n, code)`.
+
+    Args:
+        pose: `(n, 7)`.
+        support: Support functions of the convex hulls for `objects.DIRECTIONS`, `(n, 128)` (m).
+        mass: `(n,)` (kg).
+        com: Centres of mass in the mesh frame, `(n, 3)` (m).
+    """
+    encode = jax.jit(statespace.encode)
+    parts = []
+    size = min(_CHUNK, len(pose))
+    for start in range(0, len(pose), size):  # bounds the memory
+        # The last part is filled up with copies of the last object, because another size would compile anew.
+        rows = np.minimum(np.arange(start, start + size), len(pose) - 1)
+        code = _pose_codes(preprocessing, pose[rows])
+        parts.append(np.asarray(encode(code, support[rows], mass[rows], com[rows])))
+    return np.concatenate(parts)[: len(pose)]
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _pose_codes(preprocessing: Preprocessing, pose: Float[Array | np.ndarray, "*n 7"]) -> Float[Array, "*n code"]:
+    return preprocessing.encode_pose(jnp.asarray(pose))
+
+
+def state_model(
+    pairs: Pairs,
+    sensor: Sensor,
+    scenario: physics.Scenario,
+    preprocessing: Preprocessing,
+    empty: dict[str, np.ndarray],
+    *,
+    image_size: int = 64,
+) -> tuple[statespace.Config, Preprocessing]:
+    """Make the configuration of a state-space model with the network sizes of the experiments.
+
+    Args:
+        pairs: The training trajectories. They and `empty` are as for `state_arrays`.
+        sensor: Sensor of the images.
+        preprocessing: Its images must be square and show the whole view.
+        image_size: Side of the predicted images (pixels), a divisor of the side of the input images.
+
+    Returns:
+        The configuration, and the preprocessing with a new value of `absent`, as from `frame_arrays`.
+    """
+    height, width = preprocessing.resolution
+    if height != width or preprocessing.crop:
+        raise ValueError(f"a state-space model needs resolution=(n, n) and crop=False, got {preprocessing}")
+    absent = () if _touched(pairs.tactile, preprocessing, empty["tactile"]).any() else ("tactile",)
+    model = statespace.Config(
+        inputs=tuple(name for name in statespace.INPUTS if name not in absent),
+        outcomes=len(scenario.outcomes),
+        outcome_names=tuple(scenario.named(int(outcome)) for outcome in scenario.outcomes),
+        condition=len(preprocessing.condition_scale),
+        vectors=scenario.vectors if scenario.quantities else 1,
+        input_size=height,
+        image_size=image_size,
+        camera_distance=float(sensor.camera.distance),
+        view=float(optics.full_window(sensor.camera, preprocessing.resolution)[2]),
+        position_scale=preprocessing.position_scale,
+    )
+    return model, dataclasses.replace(preprocessing, absent=absent)
+
+
+def _touched(tactile: np.ndarray, preprocessing: Preprocessing, blank: np.ndarray) -> np.ndarray:
+    """Whether the first tactile image of each trajectory shows a contact, in parts that bound the memory."""
+    parts = np.array_split(tactile[:, 0], max(len(tactile) // 256, 1))
+    return np.concatenate([np.asarray(_contacts(preprocessing, part, blank)) for part in parts])
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _contacts(
+    preprocessing: Preprocessing, tactile: UInt8[Array, "n h w 3"], blank: UInt8[Array, "h w 3"]
+) -> Bool[Array, "n"]:
+    return preprocessing.touched(jnp.asarray(tactile, jnp.float32) / 255, jnp.asarray(blank, jnp.float32) / 255)
+
+
+@checked
+def shifted(
+    images: UInt8[np.ndarray, "n 2 h w 3"], empty: UInt8[np.ndarray, "h w 3"], shifts: Int[np.ndarray, "n 2"]
+) -> UInt8[np.ndarray, "n 2 h w 3"]:
+    """Shift the images of trajectories, as if the objects were at other places on a level pad.
+
+    The difference from the image of the empty pad is shifted, so that the light on the pad stays in place. The result
+    is exact for points on the pad under distant lights, except for the vignetting of visual images. For a point at the
+    height z above the pad, the shift is too large by the factor 1 + z / d, where d is the distance from the camera to
+    the pad. What the border of the image cuts off is missing after the shift, too.
+
+    Args:
+        images: First and last images, all visual or all tactile.
+        empty: Image of the empty pad, visual or tactile like `images`.
+        shifts: Rows and columns by which each trajectory is shifted (pixels), to larger indices if positive.
+    """
+    size = images.shape[2:4]
+    if (np.abs(shifts) >= size).any():
+        raise ValueError(f"`shifts` must be below {size} pixels, got up to {np.abs(shifts).max(0).tolist()}")
+    moved = np.empty_like(images)
+    for out, pair, shift in zip(moved, images, shifts, strict=True):
+        change = np.zeros(pair.shape, np.int16)
+        (to_rows, to_columns), (from_rows, from_columns) = (
+            tuple(slice(max(sign * s, 0), n + min(sign * s, 0)) for s, n in zip(shift, size, strict=True))
+            for sign in (1, -1)
+        )
+        change[:, to_rows, to_columns] = (pair.astype(np.int16) - empty)[:, from_rows, from_columns]
+        out[:] = np.clip(empty + change, 0, 255)
+    return moved

@@ -16,24 +16,18 @@ _DECAY = NOT_NEGATIVE | {"below": 1.0}
 class TrainConfig:
     """Options of a training run."""
 
-    # number of gradient steps (None: the number that `epochs` needs)
-    steps: int | None = field(default=None, metadata=COUNT)
+    steps: int | None = field(default=None, metadata=COUNT)  # gradient steps (None: as many as `epochs` needs)
     epochs: int = field(default=200, metadata=COUNT)  # passes over the training set, used if steps is None (paper: 200)
     batch_size: int = field(default=64, metadata=COUNT)  # samples in a batch (paper: 64)
-    # State-space models only: number of views in a batch, which are first frames without a trajectory, if the training
-    # set has any
+    # For state-space models: first frames without a trajectory, and trajectories without images, in a batch
     views: int = field(default=16, metadata=_NUMBER)
-    # State-space models only: number of falls in a batch, which are trajectories without images, if the training set
-    # has any
     falls: int = field(default=96, metadata=_NUMBER)
     learning_rate: float = field(default=1e-3, metadata=POSITIVE)  # learning rate of Adam (not in the paper)
     schedule: Literal["constant", "cosine"] = "constant"  # course of the learning rate. cosine falls to 0 at the end
-    # number of first steps over which the learning rate rises linearly from 0
-    warmup: int = field(default=0, metadata=_NUMBER)
+    warmup: int = field(default=0, metadata=_NUMBER)  # first steps, in which the learning rate rises linearly from 0
     b1: float = field(default=0.9, metadata=_DECAY)  # Adam's decay of the mean gradient
     b2: float = field(default=0.999, metadata=_DECAY)  # Adam's decay of the mean squared gradient
-    # Adam's epsilon, added to the root of the mean squared gradient
-    epsilon: float = field(default=1e-8, metadata=NOT_NEGATIVE)
+    epsilon: float = field(default=1e-8, metadata=NOT_NEGATIVE)  # Adam's epsilon
     # Adam's epsilon for the encoders of an `mvae` model (nats). Adam takes steps of full length even where a small beta
     # makes the gradient of the divergence small, and the encoders then collapse during the warm-up of beta. With a
     # large epsilon, gradients far below it change the encoders little.
@@ -42,11 +36,9 @@ class TrainConfig:
     clip: float | None = field(default=None, metadata=POSITIVE)
     # share of the steps over which beta rises from 0 to 1 (paper: 50 of 200 epochs)
     beta_warmup: float = field(default=0.25, metadata=SHARE)
-    # seed of the initial parameters, of the order of the samples and of the noise
-    seed: int = field(default=0, metadata=_NUMBER)
-    log_every: int = field(default=10, metadata=COUNT)  # number of steps whose mean is one record of the training log
-    # number of steps between two checkpoints, a multiple of log_every
-    checkpoint_every: int = field(default=200, metadata=COUNT)
+    seed: int = field(default=0, metadata=_NUMBER)  # of the initial parameters, the order of the samples and the noise
+    log_every: int = field(default=10, metadata=COUNT)  # steps whose mean is one record of the training log
+    checkpoint_every: int = field(default=200, metadata=COUNT)  # steps, a multiple of log_every
 
     def __post_init__(self) -> None:
         check(self)
@@ -58,22 +50,16 @@ class TrainConfig:
             raise ValueError(f"schedule must be 'constant' or 'cosine', got {self.schedule!r}")
 
     def total(self, samples: int) -> int:
-        """The number of gradient steps of the run, for a training set of `samples` samples."""
+        """The number of gradient steps for a training set of `samples` samples."""
         return self.steps if self.steps is not None else self.epochs * -(-samples // self.batch_size)
 
 
 def optimiser(config: TrainConfig, total: int) -> optax.GradientTransformation:
-    """Make the default optimiser: Adam with a learning rate schedule and gradient clipping.
-
-    Args:
-        total: Number of steps of the whole training. A cosine schedule reaches 0 after these steps.
-    """
+    """Make the default optimiser for `total` steps: Adam with a learning rate schedule and gradient clipping."""
     rate: float | optax.Schedule = config.learning_rate
     if config.schedule == "cosine":
         if config.warmup >= total:
-            raise ValueError(
-                f"warmup must be smaller than the number of steps of a cosine schedule ({total}), got {config.warmup}"
-            )
+            raise ValueError(f"warmup must be smaller than the number of steps ({total}), got {config.warmup}")
         rate = optax.cosine_decay_schedule(config.learning_rate, total - config.warmup)
     if config.warmup:
         rise = optax.linear_schedule(0.0, config.learning_rate, config.warmup)
@@ -89,7 +75,6 @@ def optimiser(config: TrainConfig, total: int) -> optax.GradientTransformation:
 
 
 def _labels(params: Any) -> Any:
-    """Label the parameters: `encoders` for the encoders of an `mvae` model, `others` for all others."""
     paper = "decoders" in params
     return jax.tree_util.tree_map_with_path(
         lambda path, _: "encoders" if paper and path[0].key == "encoders" else "others", params

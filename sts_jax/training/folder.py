@@ -2,17 +2,15 @@
 
 - `config.json`: the model, the options of the training and the preprocessing
 - `blank.npz`: the images of the empty sensor
-- `checkpoints/STEP/`: the current checkpoint, which Orbax writes in two parts, `weights` and `optimiser`. A compact
-  checkpoint is one small file with rounded weights instead
+- `checkpoints/STEP/`: the current checkpoint, which Orbax writes in the parts `weights` and `optimiser`, or one file of
+  rounded weights. A prediction reads only the weights, so that another version of optax does not matter
 - `calibration.json`: the calibration of the current checkpoint, for state-space models
 - `metrics.jsonl`: the training log, one record per line: a step, and the means of the loss terms since the last record
 - `manifest.json`: the SHA-256 of these files, the step of the current checkpoint, and the log's length at this step
 
 A new checkpoint is written first, then the manifest is replaced, then the older checkpoint is deleted. At any kill, all
-files that the manifest lists are therefore complete. A manifest of a new checkpoint does not list the calibration of
-the older one. Records of the log after the current checkpoint are not listed: a resumed training makes them again.
-
-A prediction reads only the weights, so that a model stays readable with another optimiser or version of optax.
+files that the manifest lists are therefore complete. Records of the log after the current checkpoint are not listed: a
+resumed training makes them again.
 """
 
 import contextlib
@@ -47,11 +45,11 @@ _STEP = ":step"  # suffix of the name of the array that has the steps of a kerne
 
 
 class TrainState(NamedTuple):
-    """The state of a training. Without the optimiser's state, it is what a prediction needs."""
+    """The state of a training."""
 
-    params: nnx.State  # parameters
+    params: nnx.State
     stats: nnx.State  # running batch statistics
-    optimiser: optax.OptState | None  # state of the optimiser, None if it is not written or read
+    optimiser: optax.OptState | None  # None if it is not written or read
     step: Int[Array, ""]  # gradient steps done
 
 
@@ -64,7 +62,7 @@ def manifest(folder: Path) -> storage.Manifest | None:
 
 
 def verified(folder: Path) -> int | None:
-    """Compare all files of a model but the calibration with the manifest. Return the step of its checkpoint, if any."""
+    """Compare all files but the calibration with the manifest. Return the step of the checkpoint, if any."""
     listed = manifest(folder)
     step = None if listed is None else listed.facts["step"]
     if listed is not None and step is not None:
@@ -99,9 +97,9 @@ def save(folder: Path, state: TrainState, *, compact: bool = False) -> None:
                     parts = {part: leaves for part, leaves in _parts(state).items() if leaves}
                     ocp.save_checkpointables(str(path.absolute()), parts)
         except Exception as error:  # Orbax and TensorStore raise many types, with pages of traceback
-            left = "no earlier checkpoint exists" if kept is None else f"the checkpoint of step {kept} is kept"
             raise OSError(
-                f"cannot write {path}: {_first_line(error)}. {storage.remedy(error)}, then start again ({left})."
+                f"cannot write {path}: {_first_line(error)}. {storage.remedy(error)}, then start again from step "
+                f"{kept or 0}."
             ) from None
         beside = [name for name in (CONFIG, BLANK) if (folder / name).exists()]
         known = {name: before.files[name] for name in beside if name in before.files}
@@ -117,11 +115,10 @@ def save(folder: Path, state: TrainState, *, compact: bool = False) -> None:
 
 
 def restore(folder: Path, like: TrainState) -> TrainState | None:
-    """Read the current checkpoint, after comparing all files with the manifest. None without a checkpoint.
+    """Read the current checkpoint, if any, after comparing all files with the manifest.
 
     Args:
-        like: State with the structure, shapes and dtypes of the state to read. The leaves may be abstract arrays, and
-            the optimiser may be None.
+        like: State, with abstract arrays or not, of the same structure, shapes and dtypes.
     """
     step = verified(folder)
     return None if step is None else read(folder, step, like)
@@ -140,16 +137,11 @@ def read(folder: Path, step: int, like: TrainState) -> TrainState:
             else:
                 loaded |= _read_orbax(path, part, wanted)
         except Exception as error:  # Orbax, TensorStore and zipfile raise many types, some with pages of traceback
-            reason = f"({type(error).__name__}: {_first_line(error)})"
+            problem, remedy = "cannot be read", "It belongs to another model or version of sts_jax: train again"
             if part == OPTIMISER:
-                raise ValueError(
-                    f"{path} has no state of this optimiser {reason}: give the optimiser that the training began with, "
-                    "or train in another folder. A model that Predictor.save wrote has none; Predictor.load needs none."
-                ) from None
-            raise ValueError(
-                f"{path} cannot be read {reason}, although its checksums are right. It belongs to another model or to "
-                "a version of sts_jax with other networks: load it with that version, or delete it and train again."
-            ) from None
+                problem, remedy = "has no state of this optimiser", "give the optimiser that the training began with"
+            reason = f"{type(error).__name__}: {_first_line(error)}"
+            raise ValueError(f"{path} {problem} ({reason}): {remedy}, or choose another folder.") from None
     return jax.tree.unflatten(jax.tree.structure(like), [loaded[name] for name in _plain(like)])
 
 
@@ -161,14 +153,8 @@ def records(folder: Path) -> list[Record]:
 
 def append(folder: Path, record: Record) -> None:
     """Append a record to the training log."""
-    try:
-        with (folder / LOG).open("a") as file:
-            file.write(json.dumps(record) + "\n")
-    except OSError as error:
-        raise OSError(
-            f"cannot write {folder / LOG}: {error.strerror or error}. {storage.remedy(error)}, then start again (the "
-            "last checkpoint is kept)."
-        ) from error
+    with (folder / LOG).open("a") as file:
+        file.write(json.dumps(record) + "\n")
 
 
 def resume_log(folder: Path) -> list[Record]:
@@ -184,10 +170,7 @@ def _logged(folder: Path, listed: storage.Manifest, *, whole: bool = False) -> b
     content = path.read_bytes() if path.exists() else b""
     known = content[: fact["bytes"]]
     if len(known) < fact["bytes"] or (known and hashlib.sha256(known).hexdigest() != fact["sha256"]):
-        raise storage.DamagedFileError(
-            f"{path} is not the log that {storage.MANIFEST} lists up to step {listed.facts['step']}. It was edited, "
-            f"exchanged or damaged: {_remedy(folder)}."
-        )
+        raise storage.DamagedFileError(f"{path} is not the log that {storage.MANIFEST} lists: {_remedy(folder)}.")
     return content if whole else known
 
 
@@ -208,12 +191,10 @@ def load_blank(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     """Read the images of the empty sensor, visual and tactile, uint8 (height, width, 3), from the folder of a model."""
     path, listed = folder / BLANK, manifest(folder)
     if not path.exists():
-        raise FileNotFoundError(
-            f"{path} is missing: start the training again, or write the file with training.save_blank."
-        )
+        raise FileNotFoundError(f"{path} is missing: write it with training.save_blank.")
     if listed is not None and listed.facts["step"] is not None:
         storage.verify(folder, listed, _remedy(folder), [BLANK])
-    images = storage.read_arrays(path, "delete it and start the training again, which writes the file anew")
+    images = storage.read_arrays(path, _remedy(folder))
     return images["visual"], images["tactile"]
 
 
@@ -223,7 +204,6 @@ def save_calibration(
     """Write the calibration of a model's current checkpoint.
 
     Args:
-        calibration: From `statespace.fit_calibration`.
         inputs: Inputs of the model, `Config.inputs`.
         data: Checksum of the arrays to which it was fitted, `Arrays.checksum`. None if unknown.
     """
@@ -243,7 +223,7 @@ def save_calibration(
 
 def read_calibration(folder: Path) -> tuple[statespace.Calibration, int | None] | None:
     """Read the calibration of a model, and the checksum of the arrays to which it was fitted, if any."""
-    remedy = "restore it from a copy, or calibrate again (training.calibrate, or run the experiment again)"
+    remedy = "restore it from a copy, or calibrate again (training.calibrate)"
     listed = manifest(folder)
     if listed is None or CALIBRATION not in listed.files:
         return None
@@ -271,7 +251,7 @@ def write_rounded(path: Path, arrays: Mapping[str, ArrayLike]) -> None:
 
 
 def read_rounded(path: Path) -> dict[str, np.ndarray]:
-    """Read a file that `write_rounded` wrote."""
+    """Read a file from `write_rounded`."""
     with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
         stored = dict(file)
     arrays = {name: values for name, values in stored.items() if not name.endswith(_STEP)}
@@ -307,18 +287,16 @@ def _compare(stored: Mapping[str, Any], wanted: dict[str, Any]) -> None:
 
 
 def _place(step: int) -> str:
-    """Relative path of a checkpoint."""
     return f"checkpoints/{step:08d}"
 
 
 def _files(folder: Path, step: int) -> list[str]:
-    """Relative paths of the files of a checkpoint."""
     paths = sorted(path for path in (folder / _place(step)).rglob("*") if not path.is_dir())
     return [path.relative_to(folder).as_posix() for path in paths]
 
 
 def _keep_only(folder: Path, step: int | None) -> None:
-    """Delete all checkpoints in a model's folder but that of one step. None deletes all. Other folders are kept."""
+    """Delete all checkpoints but that of one step. Other folders are kept."""
     checkpoints = folder / "checkpoints"
     for path in checkpoints.iterdir() if checkpoints.is_dir() else ():
         is_checkpoint = path.name.split(".")[0].isdecimal()  # Orbax adds a suffix to that of an unfinished one
@@ -328,10 +306,7 @@ def _keep_only(folder: Path, step: int | None) -> None:
 
 @contextlib.contextmanager
 def _quiet_orbax() -> Iterator[None]:
-    """Silence the log in which Orbax prints the tracebacks of its threads, for example 237 lines if the disk is full.
-
-    Orbax also raises the error. A thread that fails after the error was raised still logs its traceback.
-    """
+    """Silence the log in which Orbax prints the tracebacks of its threads, 237 lines if the disk is full."""
     logger = logging.getLogger("absl")
     disabled, logger.disabled = logger.disabled, True
     try:

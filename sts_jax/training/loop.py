@@ -3,46 +3,75 @@
 It is a Python loop over one compiled step, because convolutions in `lax.scan` are slow on a CPU.
 """
 
+import functools
 import json
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import nnx
-from jaxtyping import Array
+from jaxtyping import Array, PRNGKeyArray
 
-from sts_jax import storage
+from sts_jax import mvae, statespace, storage
 from sts_jax.training import config as options
 from sts_jax.training import folder
-from sts_jax.training.arrays import Arrays, Batch, order
+from sts_jax.training.arrays import Arrays, Batch, Config, check, order
 from sts_jax.training.config import TrainConfig
 from sts_jax.training.folder import Record, TrainState
-from sts_jax.training.learners import Config, Learner, Loss, Terms, learner
 from sts_jax.training.model import KINDS, Model, load
 
 Progress = Callable[[int, int, dict[str, float]], None]  # arguments: steps done, steps in total, latest record
 Log = Callable[[int, dict[str, float]], None]  # arguments: step of a record, its other numbers by name
+Terms = dict[str, Array]  # scalars by name: the loss and its parts
+
+# A loss: a pure function of a model's definition, its parameters, its running batch statistics, a random key, a batch
+# from `Arrays.take` with images as float32 in [0, 1], and beta, the weight of the divergence, which rises from 0 to 1.
+# It returns the loss, and a pair of the new batch statistics and scalars for the training log. One must be `loss`.
+Loss = Callable[
+    [nnx.GraphDef[Any], nnx.State, nnx.State, PRNGKeyArray, Batch, Array], tuple[Array, tuple[nnx.State, Terms]]
+]
+
+
+class Learner(NamedTuple):
+    """The functions that train one model."""
+
+    # Takes a random key. Returns the definition of the model, its parameters and its running batch statistics
+    init: Callable[[Array], tuple[nnx.GraphDef[Any], nnx.State, nnx.State]]
+    loss: Loss
+    check: Callable[[Arrays], None]  # raises a ValueError if a training set does not fit the model
+
+
+def learner(model: Config, *, targets: Literal["all", "own"] = "all", absent: tuple[str, ...] = ()) -> Learner:
+    """Make the learner of a model, with the loss `mvae.loss` or `statespace.loss`. Other arguments as for `train`."""
+
+    package = mvae if isinstance(model, mvae.Config) else statespace
+
+    def loss(
+        graphdef: nnx.GraphDef[Any], params: nnx.State, stats: nnx.State, key: PRNGKeyArray, batch: Batch, beta: Array
+    ) -> tuple[Array, tuple[nnx.State, Terms]]:
+        if package is mvae:
+            batch = {name: value for name, value in batch.items() if name != "empty"}
+            total, (stats, terms) = mvae.loss(
+                graphdef, params, stats, key, **batch, beta=beta, asked=targets, absent=absent
+            )
+            return total, (stats, {"loss": terms.loss, "kl": terms.kl, **terms.reconstruction})
+        batch = {name: value for name, value in batch.items() if name != "target_present"}
+        total, parts = statespace.loss(graphdef, params, key, **batch, beta=beta)
+        return total, (stats, {"loss": total, **parts})
+
+    return Learner(lambda key: package.init(key, model), loss, functools.partial(check, model, absent=absent))
 
 
 def initial(
     config: TrainConfig, learner: Learner, total: int, optimiser: optax.GradientTransformation | None = None
 ) -> tuple[nnx.GraphDef[Any], TrainState]:
-    """Initialise a model and the state of its training from `config.seed`.
-
-    Args:
-        learner: Initialisation and loss of the model, from `training.learner`.
-        total: Number of steps of the whole training, for the schedule of the default optimiser.
-        optimiser: Optimiser (default: the optimiser from `training.optimiser`).
-
-    Returns:
-        The definition of the model, and the state before the first step.
-    """
+    """Initialise a model and the state of its training from `config.seed`. Other arguments as for `step`."""
     graphdef, params, stats = learner.init(jax.random.key(config.seed))
     optimiser = optimiser or options.optimiser(config, total)
     # Without `jit`, JAX would compile a program for each shape of a parameter.
@@ -61,9 +90,7 @@ def step(
     """Make one gradient step.
 
     Args:
-        learner: Loss of the model, from `training.learner`.
-        total: Number of steps of the whole training, for the schedules of the learning rate and of beta, the weight of
-            the divergence in the loss.
+        total: Number of steps of the whole training, for the schedules of the learning rate and of beta.
         batch: Arrays of the batch, from `Arrays.take`. uint8 images are converted to float32 in [0, 1].
         optimiser: Optimiser that made `state` (default: the optimiser from `training.optimiser`).
 
@@ -105,30 +132,24 @@ def train(
     """Train a model in the folder `workdir`, or resume its training where an earlier call stopped.
 
     On one machine, a training that was killed and resumed ends with the same bits as an uninterrupted training. If the
-    training in `workdir` has finished, the model is loaded and nothing is written. Files in `workdir` that do not
-    belong to the training are not changed. Only one process at a time can train in a folder. A folder with other
-    settings, data or optimiser is refused.
+    training in `workdir` has finished, the model is loaded and nothing is written. Only one process at a time can train
+    in a folder. A folder with other settings, data or optimiser is refused.
 
     Args:
         workdir: Folder of the model, see `sts_jax.training.folder` for its files.
-        absent: For `mvae` models: names of modalities that are not inputs of any sample. `arrays.inputs` need not have
-            them.
+        absent: For `mvae` models: names of modalities that are not inputs of any sample, and not in `arrays.inputs`.
         targets: For `mvae` models: modalities to predict from each subset of the inputs, every modality (`all`) or only
             those in the subset (`own`).
         preprocessing: JSON values that describe how images and vectors were made, such as `dataclasses.asdict(p)` of a
             `Preprocessing` p. They are stored in `config.json`.
-        loss: Loss that replaces the loss from `training.learner`. `targets` and `absent` are not passed to it.
-        optimiser: Optimiser that replaces the optimiser from `training.optimiser`. The fields of `config` that define
-            Adam, the learning rate and the clipping then have no effect.
+        loss: Replaces the loss from `training.learner`. `targets` and `absent` are not passed to it.
+        optimiser: Replaces the optimiser from `training.optimiser` and its fields of `config`.
         notes: JSON values that name the given loss and optimiser, stored in `config.json`. A resumed training must have
             the same notes, because the functions themselves cannot be compared.
         progress: Function that is called after every step with the number of steps done, the number of all steps,
             and the latest record of `metrics.jsonl` (empty before the first record).
         log: Function that is called once for each record, with the step and the values of the record. A resumed
             training first calls it with the records of earlier calls of `train`.
-
-    Returns:
-        The trained model, without a calibration.
 
     Raises:
         FloatingPointError: The loss is not finite.
@@ -140,7 +161,7 @@ def train(
     if loss is not None:
         task = task._replace(loss=loss)
     settings = {
-        "kind": next(name for name, kind in KINDS.items() if isinstance(model, kind)),
+        "kind": next(name for name, kind in KINDS.items() if isinstance(model, kind.Config)),
         "model": model.to_json(),
         "training": asdict(config),
         "targets": targets,
@@ -199,8 +220,7 @@ def _run(
             if not np.isfinite(record["loss"]):
                 raise FloatingPointError(
                     f"{workdir}: the loss is {record['loss']} at step {done}: lower TrainConfig.learning_rate (now "
-                    f"{config.learning_rate}), or {'set' if config.clip is None else 'lower'} TrainConfig.clip (now "
-                    f"{config.clip}). If you gave an optimiser, change that optimiser instead."
+                    f"{config.learning_rate}) or TrainConfig.clip (now {config.clip}), or change your own optimiser."
                 )
         if done % config.checkpoint_every == 0 or done == total:
             folder.save(workdir, state)
@@ -210,7 +230,6 @@ def _run(
 
 
 def _batches(config: TrainConfig, arrays: Arrays, start: int, total: int) -> Iterator[Batch]:
-    """Iterate over the batches of the steps after step `start`."""
     further = {
         name: order(config.seed + 1, len(values["state"]), size, start, total)
         for name, values, size in (("views", arrays.views, config.views), ("falls", arrays.falls, config.falls))
@@ -221,7 +240,6 @@ def _batches(config: TrainConfig, arrays: Arrays, start: int, total: int) -> Ite
 
 
 def _send(some: list[Record], log: Log | None) -> None:
-    """Call `log` with each record."""
     if log is not None:
         for record in some:
             log(int(record["step"]), {name: value for name, value in record.items() if name != "step"})

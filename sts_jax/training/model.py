@@ -11,19 +11,13 @@ from flax import nnx
 
 from sts_jax import mvae, statespace, storage
 from sts_jax.training import folder
-from sts_jax.training.arrays import Arrays
-from sts_jax.training.learners import Config, learner
+from sts_jax.training.arrays import Arrays, Config, check
 
-# The configuration class of each `kind` in `config.json`
-KINDS: dict[str, type[Config]] = {"mvae": mvae.Config, "statespace": statespace.Config}
+KINDS: dict[str, Any] = {"mvae": mvae, "statespace": statespace}  # package of each `kind` in `config.json`
 
 
 class Model(NamedTuple):
-    """A trained model.
-
-    `graphdef` and `state` are the first two arguments of `mvae.predict` (for an `mvae` model) and `statespace.sample`
-    (for a state-space model).
-    """
+    """A trained model. `graphdef` and `state` are the first two arguments of `mvae.predict` or `statespace.sample`."""
 
     config: Config  # configuration of the model
     graphdef: nnx.GraphDef[Any]  # definition of the model
@@ -42,9 +36,7 @@ class Model(NamedTuple):
 
 
 def load(workdir: str | os.PathLike[str], *, calibrated: bool = True) -> Model:
-    """Load the model at its current checkpoint, after comparing all files of its folder with their checksums.
-
-    The optimiser's state is not read. A training may run in the folder meanwhile.
+    """Load a model, after comparing its files with their checksums. A training may run in the folder meanwhile.
 
     Args:
         workdir: Folder of the model, the `workdir` of `train`.
@@ -64,53 +56,40 @@ def load(workdir: str | os.PathLike[str], *, calibrated: bool = True) -> Model:
 def _load(workdir: Path, calibrated: bool) -> Model:
     path = workdir / folder.CONFIG
     if not path.exists():
-        raise FileNotFoundError(f"{workdir} has no config.json: give the folder of a trained model, or train one there")
+        raise FileNotFoundError(f"{workdir} has no config.json: give the folder of a trained model")
     step = folder.verified(workdir)
     if step is None:
         raise FileNotFoundError(f"{workdir} has no checkpoint: run its training until the first checkpoint is written")
     settings = storage.read_json(path, f"delete {workdir} and train again")
     try:
-        config = KINDS[settings["kind"]].from_json(settings["model"])
-        like = jax.eval_shape(lambda: _initial_weights(config))
+        kind = KINDS[settings["kind"]]
+        config = kind.Config.from_json(settings["model"])
+        graphdef, params, stats = jax.eval_shape(lambda: kind.init(jax.random.key(0), config))
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(
-            f"{path} does not describe a model that this version of sts_jax can load ({type(error).__name__}: "
-            f"{error}): use the version that trained the model, or delete {workdir} and train again"
+            f"{path} does not describe a model that this version of sts_jax can load ({error!r}): train again"
         ) from error
+    like = folder.TrainState(params, stats, None, jnp.int32(0))
     weights = folder.read(workdir, step, like)
-    graphdef = nnx.graphdef(nnx.eval_shape(lambda: _module(config)))
     fitted = folder.read_calibration(workdir) if calibrated else None
     state = nnx.merge_state(weights.params, weights.stats)
     return Model(config, graphdef, state, step, settings, fitted[0] if fitted else None)
 
 
-def _initial_weights(config: Config) -> folder.TrainState:
-    _, params, stats = learner(config).init(jax.random.key(0))
-    return folder.TrainState(params, stats, None, jnp.zeros((), jnp.int32))
-
-
-def _module(config: Config) -> nnx.Module:
-    return mvae.MVAE(config) if isinstance(config, mvae.Config) else statespace.Model(config, nnx.Rngs(0))
-
-
 def calibrate(workdir: str | os.PathLike[str], arrays: Arrays) -> Model:
     """Fit the calibration of a trained state-space model, and write it to `calibration.json` in the model's folder.
 
-    For new objects, the predicted density of the final pose is too narrow, and the outcomes can be too certain or too
-    uncertain, see `statespace.fit_calibration`. If the model was calibrated on the same arrays before, nothing is
-    fitted or written.
+    See `statespace.fit_calibration`. If the model was calibrated on the same arrays before, nothing is fitted or
+    written.
 
     Args:
         arrays: Trajectories of objects that the model was not trained on, from `state_arrays`.
-
-    Returns:
-        The model with its calibration.
     """
     path = Path(workdir)
     model = load(path, calibrated=False)
     if not isinstance(model.config, statespace.Config):
         raise ValueError(f"{path} has an mvae model, but only a state-space model can be calibrated")
-    learner(model.config).check(arrays)
+    check(model.config, arrays)
     checksum = arrays.checksum()
     with contextlib.suppress(storage.DamagedFileError):  # it is fitted again
         fitted = folder.read_calibration(path)

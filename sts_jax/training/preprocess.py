@@ -11,8 +11,7 @@ from jaxtyping import Array, Bool, Float, UInt8
 from sts_jax import geometry, storage
 from sts_jax._checked import checked
 
-# The contact test of noisy images. It has the same values as the contact test of the collection of recordings
-# (`hardware.GuideConfig`).
+# The contact test of noisy images has the same values as that of the collection of recordings (`hardware.GuideConfig`).
 _NOISY_BLOCK = 2  # pixels, side of a block
 _NOISY_BLOCKS = 3  # least number of blocks that differ
 _DEVIATIONS = 6.0  # threshold in standard deviations of a block's mean
@@ -42,15 +41,8 @@ class Preprocessing:
     scales: tuple[tuple[str, float], ...] = ()
 
     def __post_init__(self) -> None:
-        if self.rotation not in ("matrix", "quaternion"):
-            raise ValueError(f"rotation must be 'matrix' or 'quaternion', got {self.rotation!r}")
         if self.touch_block < 1 or any(side % self.touch_block for side in self.resolution):
-            raise ValueError(
-                f"touch_block must divide the height and the width of resolution {self.resolution}, got "
-                f"{self.touch_block}"
-            )
-        if self.touch_blocks < 1:
-            raise ValueError(f"touch_blocks must be >= 1, got {self.touch_blocks}")
+            raise ValueError(f"touch_block must divide resolution {self.resolution}, got {self.touch_block}")
 
     @property
     def pose_size(self) -> int:
@@ -58,14 +50,9 @@ class Preprocessing:
         return 3 + {"matrix": 9, "quaternion": 4}[self.rotation]
 
     def encode_pose(self, pose: Float[Array, "*n 7"]) -> Float[Array, "*n code"]:
-        """Encode poses for the networks.
+        """Encode poses for the networks: positions divided by `position_scale`, and rotations.
 
-        Args:
-            pose: Positions (m) and quaternions (w, x, y, z), which are normalised.
-
-        Returns:
-            Position divided by `position_scale`, then the nine entries of the rotation matrix row by row, or the unit
-            quaternion with `w >= 0` if `rotation` is `quaternion`.
+        A rotation is the nine entries of its matrix row by row, or a unit quaternion with `w >= 0`, see `rotation`.
         """
         position, quat = pose[..., :3] / self.position_scale, geometry.quat_canonical(pose[..., 3:])
         if self.rotation == "matrix":
@@ -75,8 +62,7 @@ class Preprocessing:
     def decode_pose(self, code: Float[Array, "*n code"]) -> Float[Array, "*n 7"]:
         """Decode poses from the output of a network: the inverse of `encode_pose`.
 
-        An inexact rotation matrix is replaced by the nearest rotation matrix. A quaternion is normalised, with
-        `w >= 0`. If all numbers of the rotation are 0, the identity is used.
+        The result has the nearest rotation to the code, or the identity if all numbers of the rotation are 0.
         """
         quat = code[..., 3:]
         if self.rotation == "matrix":
@@ -106,16 +92,11 @@ class Preprocessing:
         return jax.nn.sigmoid(code) if scale is None else code * scale
 
     def touched(self, tactile: Float[Array, "*n h w 3"], blank: Float[Array, "h w 3"]) -> Bool[Array, "*n"]:
-        """Find the tactile images that show a contact.
+        """Find the tactile images in [0, 1] that show a contact. If `mask_blank_touch` is False, all do.
 
         The change of a block of `touch_block` x `touch_block` pixels is its mean colour minus that of the same block in
         the blank image, and minus the median change of all blocks if `touch_level` is True. An image shows a contact if
-        the change of at least `touch_blocks` blocks exceeds `touch_threshold` in any channel. If `mask_blank_touch` is
-        False, the result is True for all images.
-
-        Args:
-            tactile: Tactile images in [0, 1].
-            blank: Tactile image of the empty sensor in [0, 1].
+        the change of at least `touch_blocks` blocks exceeds `touch_threshold` in any channel.
         """
         if not self.mask_blank_touch:
             return jnp.ones(tactile.shape[:-3], bool)
@@ -127,7 +108,7 @@ class Preprocessing:
 
     @classmethod
     def from_json(cls, content: dict[str, Any]) -> "Preprocessing":
-        """Make a preprocessing from the result of `dataclasses.asdict`, or from the same values of a JSON file."""
+        """Make a preprocessing from the JSON values of `dataclasses.asdict`."""
         if "resolution" not in content:  # it has a default value, but every model stores it
             raise ValueError(f"field preprocessing.resolution is missing, got {content!r}")
         return storage.decode(cls, content, "preprocessing")
@@ -140,9 +121,7 @@ def touch_of_noisy_images(
     """Adapt the contact test `Preprocessing.touched` to the noise of a camera's images.
 
     An image then shows a contact if at least three blocks of 2 x 2 pixels change by more than six standard deviations
-    of the noise in the mean of a block, but at least 3/255 and at most 24/255. The standard deviation is 1.4826 times
-    the median magnitude of the changes, after the median of each channel of an image is subtracted. A uniform change
-    of the light has therefore no effect, and contacts on less than half of the pad have little.
+    of the noise in the mean of a block. A robust estimate of the noise ignores contacts on less than half of the pad.
 
     Args:
         preprocessing: Preprocessing whose other fields are kept.
@@ -151,19 +130,14 @@ def touch_of_noisy_images(
     """
     if blank.shape[:2] != preprocessing.resolution or not len(tactile):
         raise ValueError(
-            f"there are {len(tactile)} images of {blank.shape[:2]} pixels, but at least one of "
-            f"preprocessing.resolution {preprocessing.resolution} is needed: resize the images"
+            f"got {len(tactile)} images of {blank.shape[:2]} pixels: give at least one of {preprocessing.resolution}"
         )
     change = _block_means(tactile.astype(np.float32) - blank, _NOISY_BLOCK)
     change = change - np.median(change, axis=(-3, -2), keepdims=True)
     noise = _NORMAL * float(np.median(np.abs(change)))
     threshold = min(max(_DEVIATIONS * noise, _SMALLEST), _LARGEST) / 255
     return dataclasses.replace(
-        preprocessing,
-        touch_threshold=threshold,
-        touch_block=_NOISY_BLOCK,
-        touch_blocks=_NOISY_BLOCKS,
-        touch_level=True,
+        preprocessing, touch_threshold=threshold, touch_block=_NOISY_BLOCK, touch_blocks=_NOISY_BLOCKS, touch_level=True
     )
 
 
