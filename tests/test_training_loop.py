@@ -44,7 +44,14 @@ def test_a_killed_run_ends_with_the_same_bits(tmp_path, finished, step):
     same(model.state, finished[1].state)
     for name in ("metrics.jsonl", "config.json"):
         assert (tmp_path / name).read_text() == (finished[0] / name).read_text()
-    assert [json.loads(line)["step"] for line in (tmp_path / "metrics.jsonl").open()] == [2, 4, 6, 8, 10, 12]
+    assert [json.loads(line)["step"] for line in (tmp_path / "metrics.jsonl").read_text().splitlines()] == [
+        2,
+        4,
+        6,
+        8,
+        10,
+        12,
+    ]
 
 
 def test_a_finished_run_is_not_changed(finished):
@@ -225,7 +232,7 @@ def test_arrays_that_do_not_fit_are_named(field, change, message):
 
 def test_an_absent_modality_is_no_input():
     training.learner(SMALL).check(arrays())
-    with pytest.raises(ValueError, match="`inputs` have the shapes .* but the model needs {'a'"):
+    with pytest.raises(ValueError, match=r"`inputs` have the shapes .* but the model needs \{'a'"):
         training.learner(SMALL, absent=("b",)).check(arrays())
 
 

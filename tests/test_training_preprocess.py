@@ -63,7 +63,7 @@ def test_noise_bright_pixels_and_a_change_of_the_light_are_no_touch_and_a_faint_
     random = np.random.default_rng(1)
 
     def taken(change):
-        noisy = np.round(BLANK + change + random.normal(0, 4, (40, *BLANK.shape)))
+        noisy = np.round(BLANK.astype(float) + change + random.normal(0, 4, (40, *BLANK.shape)))
         return np.clip(noisy, 0, 255).astype(np.uint8)
 
     imprint, bright = np.zeros(BLANK.shape), np.zeros(BLANK.shape)
