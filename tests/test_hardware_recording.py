@@ -134,20 +134,15 @@ def test_pairs_follow_the_recorded_order(tmp_path):
     assert [(*numbers([pair.visual, pair.tactile]),) for pair in pairs] == [(0, 1), (2, 3), (6, 7), (10, 9)]
 
 
-def test_images_come_at_their_times(folder):
+def test_images_come_at_their_times_and_late_readers_miss_some(folder):
     """At 10 times the speed, and never before their time. `read` returns none from before the call."""
     with hardware.Replay(folder, speed=10.0) as replay:
-        for one in replay.stream():
+        for one in itertools.islice(replay.stream(), 4):
             assert time.monotonic() >= one.time_s
-            if one.sequence == 9:
-                break
         called_s = time.monotonic()
         pair = replay.read()
-        assert min(pair.visual.time_s, pair.tactile.time_s) >= called_s
+        assert called_s <= min(pair.visual.time_s, pair.tactile.time_s)
         assert time.monotonic() >= max(pair.visual.time_s, pair.tactile.time_s)
-
-
-def test_late_readers_miss_images(folder):
     with hardware.Replay(folder, speed=1.0) as replay:
         replay._shots = replay._play(time.monotonic() - 0.4)  # the buffer covers the last 0.25 s
         (first,) = numbers([next(replay.stream())])
