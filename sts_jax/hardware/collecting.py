@@ -91,8 +91,6 @@ def collect(
     Args:
         sensor: Connected sensor.
         session: Session in which the trajectories are saved. `collect` does not close it.
-        person: Interface to the person.
-        config: Thresholds and times of the guide.
         empty: Appearance of the empty pad, from `known_pad`. None: the empty pad is measured at the beginning.
         trusted: True if the pad is certainly empty at the beginning. If False and `empty` is None, the person has to
             confirm that the pad is empty.

@@ -62,11 +62,9 @@ class Recorder:
         encoding: Encoding = "ffv1",
         file: str | os.PathLike | None = None,
     ):
-        """Create the folder.
+        """Create the folder, which must be empty or missing.
 
         Args:
-            folder: Folder of the recording, which must be empty or missing.
-            origin: Identity of the sensor.
             encoding: "ffv1" is lossless. "mjpeg" is faster and needs about a quarter of the space.
             file: Path of the sensor file or of its folder, which is copied into the recording. None: no copy.
         """
@@ -160,7 +158,6 @@ class Replay:
         """Open a recording, and compare its checksums.
 
         Args:
-            folder: Folder of the recording.
             speed: Seconds of the recording that are played per second, > 0. None: as fast as the program reads,
                 without missing images.
             loop: If True, the replay continues from the beginning after the end of the recording, with a larger

@@ -74,10 +74,9 @@ class Device:
         return self.exposure_visual, self.exposure_tactile
 
     def camera_config(self, source: str | None = None) -> CameraConfig:
-        """Return the camera's configuration with the visual exposure. Only settings of a local device are locked.
+        """The camera's configuration with the visual exposure. Only settings of a local device are locked.
 
-        Args:
-            source: Another path or URL of the same camera, such as its URL with a password.
+        `source` is another path or URL of the same camera, such as its URL with a password.
         """
         config = CameraConfig(self.camera if source is None else source, self.width, self.height, fps=self.fps)
         if config.kind != "device":
@@ -94,7 +93,6 @@ class Device:
         """Write the sensor file, the raw images of the empty pad, and at last the manifest.
 
         Args:
-            path: Folder, or path of the file in it, ending in .json.
             sensor: Constants of the simulated sensor, whose `camera` describes the rectified view.
             backgrounds: Images of the empty pad without and with light. None: those in the folder stay.
         """
@@ -135,12 +133,7 @@ class Device:
         return visual, tactile
 
     def check_identity(self, *, camera: str | None = None, leds: str | None = None) -> None:
-        """Raise a ValueError if the connected camera or LED controller is not the one of this `Device`.
-
-        Args:
-            camera: Path or URL of the connected camera. None: the camera is not compared.
-            leds: Serial number of the connected LED controller. None: the controller is not compared.
-        """
+        """Raise a ValueError if the given camera (path or URL) or controller (serial number) is another one."""
         different = []
         if camera is not None and _public(camera) != self.camera:
             different.append(f"camera {_public(camera)}")

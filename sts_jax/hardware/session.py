@@ -75,7 +75,6 @@ class RecordedTrajectory:
     number: int  # number of the trajectory in its session
     initial: Pair  # images of the held object
     final: Pair  # images of the object at rest
-    confirmed: str  # date and time of the confirmation, ISO 8601, UTC
     note: str  # text that was stored with the confirmation, may be empty
 
 
@@ -104,11 +103,9 @@ class Session:
     """
 
     def __init__(self, folder: str | os.PathLike, origin: Origin | None = None):
-        """Start a new session, or continue an existing one. The folder is locked until `close`.
+        """Start a new session, or continue one of the same sensor. The folder is locked until `close`.
 
-        Args:
-            folder: Folder of the session.
-            origin: Identity of the sensor, which is compared with that of an existing session. None: not compared.
+        Without an `origin`, the session must exist already.
         """
         self.folder = Path(folder)
         if origin is None:
@@ -316,7 +313,7 @@ class Recordings:
             )
         storage.verify(path, manifest, remedy)
         initial, final = (_read_pair(path / end, remedy) for end in _ENDS)
-        return RecordedTrajectory(number, initial, final, facts["confirmed"], facts["note"])
+        return RecordedTrajectory(number, initial, final, facts["note"])
 
     def images(
         self,
