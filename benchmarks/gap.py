@@ -170,8 +170,8 @@ def changed(clean: gap.Streams, difference: Difference, resolution: tuple[int, i
     lens = hardware.Lens.ideal(width, height)
     blender = photometry.Blender(
         difference.imperfections,
-        exposure=float(sensor.room.exposure),
-        warp=twin.lens_warp(lens, sensor.camera, (height, width)) if difference.lens else None,
+        sensor=sensor,
+        lens=lens if difference.lens else None,
         seed=seed,
     )
     streams: list[list[np.ndarray]] = [[], []]

@@ -83,7 +83,7 @@ def main(args: Args) -> None:
             device.command("hold")
             blender, seen = device.blender, scene.at(device.now_s)
             frame = blender.frame(scene.ends(seen, blender), 0.5)
-            poses = iter([seen._replace(frame=i) for i in range(1, 8)])
+            poses = iter([dataclasses.replace(seen, frame=i) for i in range(1, 8)])
             render = timed(lambda: scene.ends(next(poses), blender), 5)  # noqa: B023
             blend = timed(lambda: blender.frame(scene.ends(seen, blender), 0.5), args.frames)  # noqa: B023
             jpeg = timed(lambda: photometry.encode(frame, 92), args.frames)  # noqa: B023

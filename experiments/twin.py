@@ -1,7 +1,6 @@
 """Start a digital twin of the sensor, with its LED controller on a serial port and its camera on an HTTP server.
 
-    python -m experiments.twin                                          # the object is held and released by commands
-    python -m experiments.twin --release-every 6 --port twin-leds       # random releases, port with a fixed name
+    python -m experiments.twin --port twin-leds                         # serial port with a fixed name
     python -m experiments.twin --resolution 1232 1640 --rate 5          # image size of the paper's camera
 
 The command prints the addresses of the twin and runs until Ctrl-C. The first start compiles for about two minutes.

@@ -4,6 +4,19 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sts_jax.hardware import Lens
+
+LENS = Lens(
+    width=640,
+    height=480,
+    fx=291.0,
+    fy=287.5,
+    cx=331.2,
+    cy=228.7,
+    k=(-0.04, 0.012, -0.007, 0.0012),
+    rotation=(0.05, -0.08, 0.03),
+    translation=(0.003, -0.004, 0.103),
+)
 SAMPLES = 3  # per pixel and direction
 PIXELS_PER_M = 10_000  # of the print
 

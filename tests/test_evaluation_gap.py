@@ -31,8 +31,7 @@ def scenes(seed, trajectories):
 
 def seen(images, imperfections, seed=0, light=0.0, lens=None):
     """Images of a camera with imperfections. Under full light the scene is bright everywhere."""
-    warp = None if lens is None else twin.lens_warp(lens, Sensor().camera, SIZE)
-    blender = photometry.Blender(imperfections, warp=warp, seed=seed)
+    blender = photometry.Blender(imperfections, lens=lens, seed=seed)
     frames = [blender.frame(blender.ends(image, np.full_like(image, 0.9)), light) for image in images]
     return np.stack(frames)
 

@@ -51,9 +51,6 @@ class TwinConfig:
     object_class: Annotated[str, tyro.conf.arg(name="class")] = "camera"
     sensor: Path | None = None  # file with the sensor's constants, written by Sensor.save. None: the paper's sensor
     seed: int = 0  # seed of the object, the trajectories and the noise
-    # hold and release the object at random times. The value is the mean time of holding plus that of resting
-    # afterwards (s). None: the object moves by command only
-    release_every: float | None = None
     # rendered poses per second of a moving object. None: 10 up to 640 x 480 pixels, fewer for larger frames
     motion_rate: float | None = None
 
@@ -83,17 +80,13 @@ def make_twin(config: TwinConfig, *, first: int = 0, prepare: bool = True) -> tw
         seed=config.seed,
         first=first,
     )
-    warp = None
-    if config.field_of_view is not None:
-        lens = ideal_lens(config.resolution, config.field_of_view, sensor)
-        warp = twin.lens_warp(lens, sensor.camera, config.resolution)
+    angle = config.field_of_view
     device = twin.Twin(
         scene,
         rate=config.rate,
         imperfections=config.imperfections,
-        warp=warp,
+        lens=None if angle is None else ideal_lens(config.resolution, angle, sensor),
         seed=config.seed,
-        release_every=config.release_every,
         log=config.log,
         record=config.record,
     )

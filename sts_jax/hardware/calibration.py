@@ -25,8 +25,9 @@ LEAST_TILT = math.radians(15)  # least angle between the two boards that differ 
 MOST_TILT_ON_PAD = math.radians(30)  # largest angle between the board on the pad and the image (rad)
 
 _PAGE = (210, 297)  # width and height of A4 (mm)
-_PIXELS_PER_MM = 10
+_FRAME = 150  # side of the printed frame, which is that of the gel pad (mm)
 _RULER = 100  # length of the printed ruler (mm)
+_PIXELS_PER_MM = 10
 
 _STARTS = np.radians(np.arange(60, 221, 10))  # fields of view across the diagonal that the first estimate tries (rad)
 _WIDEST = math.radians(80)  # corners beyond this angle are not used in the first estimate of a pose (rad)
@@ -45,7 +46,7 @@ _ROWS = "top", "middle", "bottom"
 _COLUMNS = "left", "centre", "right"
 PARTS = tuple(f"{row} {column}" for row in _ROWS for column in _COLUMNS)
 
-_SHARP = "check that `board` is the printed board, sharp, evenly lit, not overexposed, and mostly in view"
+_SHARP = "Check that `board` is the printed board, sharp, evenly lit, not overexposed, and mostly in view"
 
 
 class CalibrationError(ValueError):
@@ -75,10 +76,7 @@ class Board:
             raise ValueError(f"dictionary must be one of OpenCV's, such as 'DICT_4X4_50', got {self.dictionary!r}")
         needed, available = self.columns * self.rows // 2, len(self._markers().bytesList)
         if needed > available:
-            raise ValueError(
-                f"{self.columns}x{self.rows} squares need {needed} markers, but {self.dictionary} has {available}: "
-                "choose a larger dictionary or fewer squares"
-            )
+            raise ValueError(f"the board needs {needed} markers, but the dictionary {self.dictionary} has {available}")
 
     @property
     def size(self) -> tuple[float, float]:
@@ -107,61 +105,46 @@ class FoundCorners:
     pixels: Float[np.ndarray, "n 2"]  # raw pixel coordinates (column, row) of each corner
 
 
-def board_image(
-    board: Board = Board(), *, outline: tuple[float, float] = (0.15, 0.15)
-) -> UInt8[np.ndarray, "2970 2100"]:
-    """Draw an A4 page with the board, a frame to cut along, all dimensions as text, and a ruler of 100 mm.
+def board_image(board: Board = Board()) -> UInt8[np.ndarray, "2970 2100"]:
+    """Draw an A4 page with 10 pixels per mm: the board, a frame of the pad's size to cut along, and a ruler of 100 mm.
 
-    Args:
-        board: The board to draw.
-        outline: Width and height of the frame (m). With those of the gel pad, the cut sheet covers the pad exactly.
-
-    Returns:
-        Grey image with 10 pixels per mm.
+    The middle of the board is that of the frame, and its dimensions are printed as text.
     """
-    frame = [round(1000 * side * _PIXELS_PER_MM) for side in outline]
-    pixels = [round(1000 * side * _PIXELS_PER_MM) for side in board.size]
-    largest = _PAGE[0] - 10, _PAGE[1] - 60
-    if not all(p <= f <= _PIXELS_PER_MM * m for p, f, m in zip(pixels, frame, largest, strict=True)):
+    width, height = (round(1000 * side * _PIXELS_PER_MM) for side in board.size)
+    frame = _FRAME * _PIXELS_PER_MM
+    if max(width, height) > frame:
         raise ValueError(
-            f"outline is {_mm(outline)}, but must be at least the board's {_mm(board.size)}, and at most "
-            f"{largest[0]} mm x {largest[1]} mm to fit on an A4 page"
+            f"the board is {_mm(board.size)}, but must fit in the frame of {_FRAME} mm: use smaller squares"
         )
     page = np.full((_PAGE[1] * _PIXELS_PER_MM, _PAGE[0] * _PIXELS_PER_MM), 255, np.uint8)
-    left, top = (page.shape[1] - frame[0]) // 2, 10 * _PIXELS_PER_MM
-    cv2.rectangle(page, (left - 1, top - 1), (left + frame[0], top + frame[1]), 160, 1)
-    x, y = left + (frame[0] - pixels[0]) // 2, top + (frame[1] - pixels[1]) // 2
-    page[y : y + pixels[1], x : x + pixels[0]] = board.opencv().generateImage((pixels[0], pixels[1]))
-    row = top + frame[1] + 10 * _PIXELS_PER_MM
+    left, top = (page.shape[1] - frame) // 2, 10 * _PIXELS_PER_MM
+    cv2.rectangle(page, (left - 1, top - 1), (left + frame, top + frame), 160, 1)
+    x, y = left + (frame - width) // 2, top + (frame - height) // 2
+    page[y : y + height, x : x + width] = board.opencv().generateImage((width, height))
+    row = top + frame + 10 * _PIXELS_PER_MM
     for line in (
         f"{board.columns} x {board.rows} squares of {1000 * board.square:g} mm, markers of {1000 * board.marker:g} mm "
         f"({board.dictionary})",
-        f"Board {_mm(board.size)}, grey frame {_mm(outline)}",
+        f"Board {_mm(board.size)}, grey frame {_FRAME} mm x {_FRAME} mm",
         f"Print at 100 %. The line below is {_RULER} mm long.",
     ):
         cv2.putText(page, line, (left, row), cv2.FONT_HERSHEY_SIMPLEX, 1.2, 0, 2, cv2.LINE_AA)
         row += 7 * _PIXELS_PER_MM
-    cv2.rectangle(page, (left, row), (left + _RULER * _PIXELS_PER_MM - 1, row + 4), 0, -1)
-    for end in (left, left + _RULER * _PIXELS_PER_MM - 1):
+    right = left + _RULER * _PIXELS_PER_MM - 1
+    cv2.rectangle(page, (left, row), (right, row + 4), 0, -1)
+    for end in (left, right):
         cv2.line(page, (end, row - 20), (end, row + 24), 0, 1)
     return page
 
 
-def save_board(path: str | os.PathLike, board: Board = Board(), *, outline: tuple[float, float] = (0.15, 0.15)) -> None:
+def save_board(path: str | os.PathLike, board: Board = Board()) -> None:
     """Save the page of `board_image` as .pdf or .png, whose print at 100 % has the true size."""
-    path = Path(path)
-    if path.suffix.lower() not in (".pdf", ".png"):
+    kind = Path(path).suffix.lower().removeprefix(".")
+    if kind not in ("pdf", "png"):
         raise ValueError(f"path must end in .pdf or .png, got {path}")
-    page = Image.fromarray(board_image(board, outline=outline))
-    dots_per_inch = 25.4 * _PIXELS_PER_MM
-
-    def write(temporary: Path) -> None:
-        if path.suffix.lower() == ".pdf":
-            page.save(temporary, "PDF", resolution=dots_per_inch)
-        else:
-            page.save(temporary, "PNG", dpi=(dots_per_inch, dots_per_inch))
-
-    storage.write_whole(path, write)
+    page, dots_per_inch = Image.fromarray(board_image(board)), 25.4 * _PIXELS_PER_MM
+    options = {"resolution": dots_per_inch} if kind == "pdf" else {"dpi": (dots_per_inch, dots_per_inch)}
+    storage.write_whole(Path(path), lambda temporary: page.save(temporary, kind, **options))
 
 
 @checked
@@ -197,23 +180,22 @@ def calibrate(
 ) -> Calibration:
     """Calibrate a lens and the camera's pose in the sensor from raw images of a board.
 
-    In one image, the board must lie on the outer face of the gel pad, with the print towards the camera, centred, and
-    with its edges parallel to those of the pad (in any of the four orientations). Among the other images, the distance,
-    position and tilt of the board must vary.
+    In the image `on_pad`, the board lies on the outer face of the gel pad, with the print towards the camera, centred,
+    and with its edges parallel to those of the pad (in any of the four orientations). Among the other images, the
+    distance, position and tilt of the board vary.
 
     Args:
-        images: Raw images of one camera and one size, RGB or grey. At least 6 must show 12 corners of the board or
-            more.
+        images: At least 6 raw images of one camera and one size, RGB or grey, that show 12 corners of the board.
         board: The printed board.
-        on_pad: Index in `images` of the image in which the board lies on the pad.
+        on_pad: Index of the image in which the board lies on the pad.
         largest_error: Largest allowed root mean square of the reprojection errors of an image (pixels).
 
     Raises:
         CalibrationError: The images do not determine the lens. The message names the images.
     """
-    if len({image.shape[:2] for image in images}) > 1:
-        names = ", ".join(f"{w}x{h}" for h, w in sorted({image.shape[:2] for image in images}))
-        raise ValueError(f"all images must have the same size, got {names} pixels: use one setting of the camera")
+    sizes = sorted({image.shape[1::-1] for image in images})
+    if len(sizes) > 1:
+        raise ValueError(f"all images must have the same size, got {sizes} pixels: use one setting of the camera")
     height, width = images[0].shape[:2] if images else (1, 1)
     corners = [find_board(image, board) for image in images]
     return fit_lens(corners, (width, height), board, on_pad=on_pad, largest_error=largest_error)
@@ -234,11 +216,6 @@ def fit_lens(
     width, height = size
     if not 0 <= on_pad < max(1, len(corners)):
         raise ValueError(f"on_pad must be the index of an image, got {on_pad} (number of images: {len(corners)})")
-    if len(corners) < FEWEST_IMAGES:
-        raise CalibrationError(
-            f"a calibration needs at least {FEWEST_IMAGES} images of the board in different poses, but only "
-            f"{len(corners)} are given: take more images"
-        )
     counts = tuple(len(found.numbers) for found in corners)
     used = _usable(counts, on_pad)
     views = _Views(
@@ -274,9 +251,8 @@ class _Views(NamedTuple):
     def residuals(self, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Projections minus found corners (pixels), shape (n, 2), and angles from the optical axis (rad), shape (n,).
 
-        Args:
-            unknowns: fx, fy, cx, cy, k1 to k4 and, for each image, rotation vector and translation (m) from board to
-                camera, shape (8 + 6 images,).
+        The unknowns, shape (8 + 6 images,), are fx, fy, cx, cy, k1 to k4 and, for each image, rotation vector and
+        translation (m) from board to camera.
         """
         poses = unknowns[8:].reshape(-1, 6)
         matrices = Rotation.from_rotvec(poses[:, :3]).as_matrix()[self.image]
@@ -319,28 +295,23 @@ def _first_estimate(views: _Views, width: int, height: int) -> np.ndarray:
 def _usable(counts: tuple[int, ...], on_pad: int) -> list[int]:
     """The indices of the images with enough corners. Raises an error if they are too few or `on_pad` is missing."""
     used = [i for i, count in enumerate(counts) if count >= FEWEST_CORNERS]
-    poor = [f"{i} ({count} corners)" for i, count in enumerate(counts) if count < FEWEST_CORNERS]
-    if on_pad not in used:
+    poor = ", ".join(f"{i} ({count} corners)" for i, count in enumerate(counts) if count < FEWEST_CORNERS) or "none"
+    if len(used) < FEWEST_IMAGES or on_pad not in used:
         raise CalibrationError(
-            f"image {on_pad} must show the board on the pad with at least {FEWEST_CORNERS} corners, but it shows "
-            f"{counts[on_pad]}: set on_pad, or {_SHARP}"
-        )
-    if len(used) < FEWEST_IMAGES:
-        raise CalibrationError(
-            f"only {len(used)} of {len(counts)} images show at least {FEWEST_CORNERS} corners of the board, but "
-            f"{FEWEST_IMAGES} are needed. Too few corners were found in {_listed(poor)}: {_SHARP}"
+            f"{len(used)} of {len(counts)} images show at least {FEWEST_CORNERS} corners of the board, but "
+            f"{FEWEST_IMAGES} must, with image {on_pad} of the board on the pad. Too few corners: {poor}. {_SHARP}"
         )
     return used
 
 
 def _check_errors(errors: list[float | None], largest: float) -> None:
-    """Raise an error if the reprojection error of an image is too large."""
-    bad = [f"{i} ({error:.2f} pixels)" for i, error in enumerate(errors) if error is not None and error > largest]
+    bad = ", ".join(
+        f"{i} ({error:.2f} pixels)" for i, error in enumerate(errors) if error is not None and error > largest
+    )
     if bad:
         raise CalibrationError(
-            f"the reprojection error is larger than largest_error = {largest:g} pixels in {_listed(bad)}: leave these "
-            "images out if they are few. Otherwise check that the board is flat, that its squares have the size "
-            "`Board.square`, and that focus and image size were the same for all images"
+            f"the reprojection error exceeds {largest:g} pixels in images {bad}: leave them out, or check that the "
+            "board is flat, that its squares have the size `Board.square`, and that the focus did not change"
         )
 
 
@@ -350,50 +321,32 @@ def _check_tilts(poses: np.ndarray) -> None:
     spread = math.acos(float(np.clip((normals @ normals.T).min(), -1, 1)))
     if spread < LEAST_TILT:
         raise CalibrationError(
-            f"the tilts of the board differ by at most {math.degrees(spread):.0f} degrees, but the focal length needs "
-            f"{math.degrees(LEAST_TILT):.0f} degrees: tilt the board by 20 to 40 degrees, each time in another "
-            "direction"
+            f"the tilts of the board differ by only {math.degrees(spread):.0f} degrees, which does not determine the "
+            "focal length: tilt the board by 20 to 40 degrees, each time in another direction"
         )
 
 
 def _pose_on_pad(pose: np.ndarray, index: int) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """The rotation vector and the translation from the sensor frame to the camera frame.
+    """Rotation vector and translation from the sensor frame to the camera frame, from those of the board on the pad.
 
-    The sensor frame is the frame of the board on the pad, turned by a multiple of 90 degrees so that x points to the
-    right of the image.
-
-    Args:
-        pose: Rotation vector (rad) and translation (m) from the board on the pad to the camera, shape (6,).
-        index: Index of the image, for error messages.
+    The sensor frame is the board's frame, turned by a multiple of 90 degrees so that x points to the image's right.
     """
     board = Rotation.from_rotvec(pose[:3])
     turns = [board * Rotation.from_euler("z", quarter * math.pi / 2) for quarter in range(4)]
     sensor = max(turns, key=lambda turn: turn.as_matrix()[0, 0])
     tilt = math.acos(float(np.clip(sensor.as_matrix()[2, 2], -1, 1)))
     twist = math.atan2(sensor.as_matrix()[1, 0], sensor.as_matrix()[0, 0])
-    for angle, words in ((tilt, "tilted against"), (abs(twist), "rotated in")):
-        if angle > MOST_TILT_ON_PAD:
-            raise CalibrationError(
-                f"the board of image {index} is {words} the image plane by {math.degrees(angle):.0f} degrees, but a "
-                f"board on the pad by at most {math.degrees(MOST_TILT_ON_PAD):.0f} degrees: set on_pad to the image "
-                "with the board on the pad, or mount the camera parallel to the pad and its edges"
-            )
+    if max(tilt, abs(twist)) > MOST_TILT_ON_PAD:
+        raise CalibrationError(
+            f"the board of image {index} is tilted by {math.degrees(tilt):.0f} and turned by {math.degrees(twist):.0f} "
+            f"degrees, so it does not lie on the pad: set on_pad, or mount the camera parallel to the pad and its edges"
+        )
     (x, y, z), (tx, ty, tz) = sensor.as_rotvec().tolist(), pose[3:].tolist()
     return (x, y, z), (tx, ty, tz)
 
 
-def _listed(names: Sequence[object]) -> str:
-    """A text such as "images 2, 5"."""
-    return f"image{'s' if len(names) > 1 else ''} {', '.join(map(str, names))}"
-
-
 def view_angle(lens: Lens, pinhole: Camera) -> float:
-    """Largest angle from the optical axis of the real camera to a point of the sensor's view, which is a corner (rad).
-
-    Args:
-        lens: The lens and the pose of the real camera.
-        pinhole: The simulated camera that defines the view, from `Sensor.camera`.
-    """
+    """Largest angle from the optical axis of the real camera to a corner of the sensor's view (rad)."""
     left, top, width, height = window(pinhole, _RESOLUTION)
     corners = np.array([(x, y, 0.0) for x in (left, left + width) for y in (top, top + height)])
     seen = corners @ lens.matrix.T + np.asarray(lens.translation)
@@ -414,9 +367,8 @@ def check_view(lens: Lens, pinhole: Camera, largest_angle: float | None = None) 
     needed = view_angle(lens, pinhole)
     if largest_angle is not None and needed > largest_angle + _EXTRAPOLATION:
         raise CalibrationError(
-            f"the corners of the sensor's view are up to {math.degrees(needed):.1f} degrees from the optical axis, but "
-            f"the calibration images show the board only up to {math.degrees(largest_angle):.1f} degrees: take more "
-            "images with the board in the corners of the image, and calibrate again"
+            f"the sensor's view reaches {math.degrees(needed):.1f} degrees from the optical axis, but the boards only "
+            f"{math.degrees(largest_angle):.1f} degrees: take more images with the board in the corners of the image"
         )
     try:
         pixels = rectification(lens, pinhole, _RESOLUTION)
@@ -434,13 +386,9 @@ def check_view(lens: Lens, pinhole: Camera, largest_angle: float | None = None) 
 
 
 def covered(corners: Sequence[FoundCorners], size: tuple[int, int]) -> tuple[str, ...]:
-    """Return the parts of the raw image, such as "top left", in which any corner of the board was found.
+    """Return the parts of raw images (width, height), such as "top left", in which any corner of the board was found.
 
     Of the 3 x 3 parts, the outer rows and columns have 20 % of the image's height and width.
-
-    Args:
-        corners: Corners of the board in each image, from `find_board`.
-        size: Width and height of the raw images (pixels).
     """
     pixels = np.concatenate([np.zeros((0, 2)), *(found.pixels for found in corners)])
     thirds = np.digitize((pixels + 0.5) / np.asarray(size), [_OUTER, 1 - _OUTER])

@@ -13,13 +13,12 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, UInt, UInt8
 from scipy.spatial.transform import Rotation
 
 from sts_jax._checked import checked
 from sts_jax.optics import Camera
 
-MOST_ANGLE = math.pi  # angle of a ray that points backwards along the optical axis (rad)
 _MARGIN = 16  # distance beyond the image's border at which coordinates are clipped (pixels)
 _BAND = 256  # number of rows of a map that are computed at once, which limits the memory
 _GRAZING = 1e-6  # smallest cosine of the angle between a ray and the pad's normal for which they intersect
@@ -53,20 +52,14 @@ class Lens:
     translation: tuple[float, float, float]  # centre of the gel's outer face in the camera frame (m)
 
     def __post_init__(self) -> None:
-        for name in ("width", "height", "fx", "fy"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be > 0, got {getattr(self, name)}")
+        if min(self.width, self.height, self.fx, self.fy) <= 0:
+            raise ValueError(f"width, height, fx and fy must be > 0, got {self}")
         if not np.isfinite([self.fx, self.fy, self.cx, self.cy, *self.k, *self.rotation, *self.translation]).all():
             raise ValueError(f"all numbers of a lens must be finite, got {self}")
-        if self.translation[2] <= 0:
+        if self.translation[2] <= 0 or self.center[2] >= 0:
             raise ValueError(
-                f"translation[2] must be > 0 m, so that the pad is before the camera, got {self.translation[2]} m"
-            )
-        if self.center[2] >= 0:
-            raise ValueError(
-                f"rotation {self.rotation} and translation {self.translation} place the camera at "
-                f"{tuple(round(float(c), 4) for c in self.center)} m in the sensor frame, but it must lie inside the "
-                "sensor, where z < 0: give the transformation from the sensor frame to the camera frame"
+                f"rotation and translation must be those from the sensor frame to the camera frame, with the camera "
+                f"inside the sensor (z < 0) and the pad before it, got {self.rotation} and {self.translation}"
             )
 
     @classmethod
@@ -80,10 +73,9 @@ class Lens:
             height: Height of the raw image (pixels).
             field_of_view: Field of view across the image's diagonal, in (0, 2 pi] (rad). The default is that of the
                 paper's sensor (Rezaei-Shoshtari et al. 2021).
-            distance: Distance from the camera to the gel's outer face (m). The default is the value in the code of the
-                paper.
+            distance: Distance from the camera to the gel's outer face (m). The default is that of the paper's code.
         """
-        if not 0 < field_of_view <= 2 * MOST_ANGLE:
+        if not 0 < field_of_view <= 2 * math.pi:
             raise ValueError(f"field_of_view must be in (0, 2 pi] rad, got {field_of_view}")
         focal = math.hypot(width, height) / field_of_view
         middle = (width - 1) / 2, (height - 1) / 2
@@ -101,10 +93,7 @@ class Lens:
 
     @property
     def largest_angle(self) -> float:
-        """Largest angle from the optical axis at which the model is valid (rad). Beyond it, the polynomial d(a) falls.
-
-        No real lens projects two angles to the same pixel.
-        """
+        """Largest angle from the optical axis at which the model is valid (rad): beyond it, d(a) falls."""
         return _largest_angle(self.k)
 
 
@@ -146,8 +135,7 @@ def rectification(lens: Lens, pinhole: Camera, resolution: tuple[int, int]) -> F
     if np.isnan(pixels).any():
         raise ValueError(
             f"the model of the lens is valid up to {math.degrees(lens.largest_angle):.1f} degrees from the optical "
-            f"axis, but {np.isnan(pixels[..., 0]).sum()} of {rows * columns} points of the sensor's view lie at larger "
-            "angles: calibrate the lens again, with images of the calibration board in the corners of the view"
+            "axis, which is less than the sensor's view: calibrate the lens again, with the board in the view's corners"
         )
     return pixels
 
@@ -159,23 +147,14 @@ def rectified(
     """Rectify a raw image: convert the image of the real camera to the view of the simulated pinhole camera.
 
     Each rectified pixel is the mean of samples that are at most about one raw pixel apart, so small images show no
-    aliasing. The positions of the samples are cached for the eight most recent combinations of the other arguments.
-
-    Args:
-        lens: The lens and the pose of the real camera.
-        pinhole: The simulated camera that defines the view, from `Sensor.camera`.
-        image: Raw image, `lens.height` x `lens.width` pixels.
-        resolution: Height and width of the rectified image (pixels).
-
-    Returns:
-        Rectified image. Parts of the view that the camera does not see are black.
+    aliasing. Parts of the view that the camera does not see are black.
     """
     if image.shape[:2] != (lens.height, lens.width):
         raise ValueError(
             f"the image has {image.shape[1]}x{image.shape[0]} pixels, but the lens was calibrated with images of "
             f"{lens.width}x{lens.height} pixels: set the camera to this size, or calibrate the lens again"
         )
-    maps = _rectifying_maps(lens, plain(pinhole), resolution)
+    maps = _rectifying_maps(lens, _plain(pinhole), resolution)
     sampled = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
     return _averaged(sampled, resolution)
 
@@ -206,21 +185,21 @@ def distortion(
 def distorted(
     lens: Lens,
     pinhole: Camera,
-    image: UInt8[np.ndarray, "height width *channels"],
+    image: UInt[np.ndarray, "height width *channels"],
     *,
     outside: float | tuple[float, float, float],
-    samples: int | None = None,
-) -> Raw:
+    most_samples: int | None = None,
+) -> UInt[np.ndarray, "rows columns *channels"]:
     """Convert a rectified image to the raw image that the real camera would take of it. Inverse of `rectified`.
 
     Args:
         lens: The lens and the pose of the real camera.
         pinhole: The simulated camera that defines the view.
-        image: Rectified image of the whole view, such as an image of `sts_jax.sense`.
-        outside: Grey value or RGB colour of the raw pixels outside of the view, 0 to 255.
-        samples: Number of samples per raw pixel in each direction, >= 1. None: as many as avoid aliasing.
+        image: Rectified image of the whole view, uint8 or uint16.
+        outside: Grey value or RGB colour of the raw pixels outside of the view.
+        most_samples: Limit of the samples per raw pixel in each direction. None: as many as avoid aliasing.
     """
-    maps = distorting_maps(lens, plain(pinhole), image.shape[:2], samples)
+    maps = _distorting_maps(lens, _plain(pinhole), image.shape[:2], most_samples)
     colour = (outside,) * 4 if isinstance(outside, int | float) else outside
     sampled = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=colour)
     return _averaged(sampled, (lens.height, lens.width))
@@ -238,7 +217,7 @@ def window(pinhole: Camera, resolution: tuple[int, int]) -> tuple[float, float, 
     return -width / 2, -height / 2, width, height
 
 
-def plain(pinhole: Camera) -> Camera:
+def _plain(pinhole: Camera) -> Camera:
     """The camera with Python numbers, as a hashable key for the cached maps."""
     return Camera(*(float(getattr(pinhole, field.name)) for field in dataclasses.fields(Camera)))
 
@@ -254,33 +233,17 @@ def _rectifying_maps(lens: Lens, pinhole: Camera, resolution: tuple[int, int]) -
 
 
 @functools.lru_cache(maxsize=2)
-def distorting_maps(
-    lens: Lens, pinhole: Camera, resolution: tuple[int, int], samples: int | None = None, most: int | None = None
-) -> Maps:
-    """Rectified pixel of each sample of each raw pixel.
-
-    Args:
-        lens: The lens and the pose of the real camera.
-        pinhole: The simulated camera that defines the view, with Python numbers.
-        resolution: Height and width of the rectified image (pixels).
-        samples: Number of samples per raw pixel in each direction. None: as many as avoid aliasing, at most `most`.
-        most: Limit of the number that avoids aliasing. None: no limit.
-    """
-    if samples is None:
-        samples = _samples(distortion(lens, pinhole, resolution), resolution, 1)
-        samples = samples if most is None else min(samples, most)
-    if samples < 1:
-        raise ValueError(f"samples must be >= 1 or None, got {samples}")
+def _distorting_maps(lens: Lens, pinhole: Camera, resolution: tuple[int, int], most_samples: int | None) -> Maps:
+    """Rectified pixel of each sample of each raw pixel."""
+    samples = _samples(distortion(lens, pinhole, resolution), resolution, 1)
+    samples = samples if most_samples is None else min(samples, most_samples)
     return _fixed_point(distortion(lens, pinhole, resolution, samples), resolution)
 
 
 def _samples(coordinates: np.ndarray, size: tuple[int, int], probes: int) -> int:
-    """The number of samples per pixel in each direction with which a map skips no pixel of the source image.
+    """The number of samples per pixel and direction with which a map skips no pixel of a source image (height, width).
 
-    Args:
-        coordinates: Coordinates in the source image, at `probes` x `probes` points of each pixel, (rows, columns, 2).
-        size: Height and width of the source image (pixels).
-        probes: Number of points per pixel in each direction.
+    `coordinates`, (rows, columns, 2), has `probes` x `probes` points of each pixel.
     """
     inside = (coordinates > -0.5) & (coordinates < np.array(size[::-1]) - 0.5)
     coordinates = np.where(inside.all(axis=-1, keepdims=True), coordinates, np.nan)
@@ -329,7 +292,7 @@ def _largest_angle(k: tuple[float, ...]) -> float:
     """The smallest positive root of the derivative of `distort_angle`, at most pi."""
     roots = np.roots([9 * k[3], 7 * k[2], 5 * k[1], 3 * k[0], 1.0])
     real = roots[(np.abs(roots.imag) < 1e-9 * np.maximum(1, np.abs(roots))) & (roots.real > 0)].real
-    return min([MOST_ANGLE, *np.sqrt(real).tolist()])
+    return min([math.pi, *np.sqrt(real).tolist()])
 
 
 class SensorView(NamedTuple):
@@ -360,11 +323,8 @@ def relit(view: SensorView, background: SensorView, empty: SensorView) -> Sensor
     Args:
         view: Rectified images of a sensor.
         background: Rectified images of the same sensor's empty pad.
-        empty: Images of the empty pad of the sensor on which the model was trained, `SensorView(**predictor.empty)`.
+        empty: Images of the empty pad with which the model was trained, `SensorView(**predictor.empty)`.
     """
-    shapes = {"view": view.visual.shape, "background": background.visual.shape, "empty": empty.visual.shape}
-    if len(set(shapes.values())) > 1:
-        raise ValueError(f"view, background and empty must have the same shape, got {shapes}: use one resolution")
     return SensorView(
         *(
             np.clip(image * there / np.maximum(here, 1 / 255), 0, 1)

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import itertools
 import json
 import math
 import os
@@ -9,7 +10,6 @@ import random
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import NamedTuple
 
 import numpy as np
@@ -19,16 +19,20 @@ from sts_jax import storage
 from sts_jax.hardware import protocol
 from sts_jax.hardware.emulation import EmulatedController
 from sts_jax.hardware.leds import Lit
+from sts_jax.hardware.lens import Lens
 from sts_jax.hardware.twin import photometry
-from sts_jax.hardware.twin.scene import Phase, Scene
+from sts_jax.hardware.twin.scene import Scene, Seen
 
 ANSWER_S = 0.004  # duration of a request on the virtual clock (s). Its levels apply after half of this time
 _TICK_S = 0.005  # period with which the watchdog is checked on the virtual clock (s)
 
 
 @dataclasses.dataclass(frozen=True)
-class Exposure:
-    """The ground truth of one frame. Times are on the twin's clock, `time.monotonic` if the twin is served."""
+class Exposure(Seen):
+    """The ground truth of one frame, with the scene in the middle of the exposure.
+
+    Times are on the twin's clock, `time.monotonic` if the twin is served.
+    """
 
     index: int  # number of the frame, from 0
     start_s: float  # begin of the exposure (s)
@@ -37,21 +41,13 @@ class Exposure:
     light: float  # mean brightness of the LEDs during the exposure, as a share of their full power
     lowest: float  # smallest brightness during the exposure, as a share
     highest: float  # largest brightness during the exposure, as a share
-    phase: str  # phase of the scene in the middle of the exposure: empty, held, moving or still
-    trajectory: int  # number of the current or last trajectory, or -1 before the first one
-    frame: int  # index of the rendered pose in the trajectory
-    pose: tuple[float, ...] | None  # object's position (m) and quaternion (w, x, y, z), or None without an object
 
 
 @dataclasses.dataclass(frozen=True)
-class State:
+class State(Seen):
     """The scene, the lights and the camera at one time."""
 
     now_s: float  # time on the twin's clock (s)
-    phase: str  # phase of the scene: empty, held, moving or still
-    trajectory: int  # number of the current or last trajectory, or -1 before the first one
-    frame: int  # index of the rendered pose in the trajectory
-    pose: tuple[float, ...] | None  # object's position (m) and quaternion (w, x, y, z), or None without an object
     levels: protocol.Levels  # duty cycles of the four LED channels, 0 to 255
     counter: int  # number of changes of the levels since the controller's boot
     boot: int  # number of the controller's boot
@@ -81,26 +77,14 @@ class Twin:
     ```
     """
 
-    # `_boot` sets these.
-    _epoch_s: float  # begin of the camera's first exposure
-    _controller: EmulatedController
-    _lights: photometry.LightHistory
-    _sequence: int  # number of the last request of `set` and `ping`
-    _index: int  # number of the last frame that `capture` returned
-    _frames: int  # number of frames produced so far
-    _due_s: float  # time of delivery of the last frame
-    _phase: str | None  # phase at the last call of `operate`
-    _next_s: float  # time of the next command of `operate`
-
     def __init__(
         self,
         scene: Scene,
         *,
         rate: float = 30.0,
         imperfections: photometry.Imperfections | None = None,
-        warp: photometry.Warp | None = None,
+        lens: Lens | None = None,
         seed: int = 0,
-        release_every: float | None = None,
         log: str | os.PathLike | None = None,
         record: str | os.PathLike | None = None,
     ):
@@ -110,34 +94,31 @@ class Twin:
             scene: Scene in front of the camera.
             rate: Frame rate of the camera (frames/s).
             imperfections: Deviations of the camera and the lights from ideal ones. Default: `Imperfections()`.
-            warp: Lens distortion, made by `lens_warp`. Default: no distortion.
-            seed: Seed of the noise, of the random delays of the frames, and of `release_every`.
-            release_every: Mean time for which the object is held plus mean time for which it then rests (s). The twin
-                holds and releases it at random times. Default: the object moves only when `command` is called.
+            lens: Fisheye lens of the camera. Default: the frames are rectified.
+            seed: Seed of the noise and of the random delays of the frames.
             log: File that receives one JSON line with the fields of `Exposure` per frame.
             record: Motion JPEG file that receives all frames in the order of the log.
         """
         self.imperfections = photometry.Imperfections() if imperfections is None else imperfections
-        if not 0 < rate <= 1 / self.imperfections.exposure_s:
-            raise ValueError(
-                f"rate is {rate:g} frames/s, but must be > 0 and at most 1 / imperfections.exposure_s = "
-                f"{1 / self.imperfections.exposure_s:g}: give a smaller rate or exposure_s"
-            )
-        if release_every is not None and not 0 < release_every < math.inf:
-            raise ValueError(f"release_every must be None or a positive and finite time (s), got {release_every}")
+        fastest = 1 / self.imperfections.exposure_s
+        if not 0 < rate <= fastest:
+            raise ValueError(f"rate must be in (0, 1 / imperfections.exposure_s = {fastest:g}] frames/s, got {rate:g}")
         self.scene = scene
         self.rate = rate
         self.serial_number = f"TWIN{seed}"  # of the LED controller
-        self.blender = photometry.Blender(self.imperfections, exposure=scene.exposure, warp=warp, seed=seed)
-        self._release_every = release_every
+        self.blender = photometry.Blender(self.imperfections, sensor=scene.sensor, lens=lens, seed=seed)
         self._random = random.Random(seed)
         self._lock = threading.Lock()  # protects the controller, the lights and the scene's commands
         self._commands = threading.Lock()  # lets one command run at a time
         self._clock: Callable[[], float] | None = None
         self._virtual_s = 0.0
+        self._sequence = itertools.cycle(range(1, protocol.LAST_SEQUENCE + 1))  # numbers of requests
+        self._index = -1  # number of the last frame that `capture` returned
+        self._frames = 0  # number of frames produced so far
+        self._due_s = -math.inf  # time of delivery of the last frame
         with contextlib.ExitStack() as files:
-            self._lines = None if log is None else files.enter_context(Path(log).open("w", buffering=1))
-            self._jpegs = None if record is None else files.enter_context(Path(record).open("wb", buffering=0))
+            self._log = None if log is None else files.enter_context(Path(log).open("w", buffering=1))
+            self._record = None if record is None else files.enter_context(Path(record).open("wb", buffering=0))
             self._files = files.pop_all()  # keeps the files open after this block, because both could be opened
         self._boot(0.0)
 
@@ -151,7 +132,14 @@ class Twin:
         """The current state of the scene, the lights and the camera."""
         with self._lock:
             now, leds = self.now_s, self._controller
-            return State(now, *self.scene.at(now), leds.levels, leds.counter, leds.boot, self._frames)
+            return State(
+                **vars(self.scene.at(now)),
+                now_s=now,
+                levels=leds.levels,
+                counter=leds.counter,
+                boot=leds.boot,
+                frames=self._frames,
+            )
 
     def run_on(self, clock: Callable[[], float]) -> None:
         """Replace the virtual clock, which must not have advanced, by a function such as `time.monotonic`."""
@@ -177,17 +165,6 @@ class Twin:
                 self.scene.command(command, self.now_s)
         return self.state
 
-    def operate(self) -> None:
-        """Hold or release the object when a random time of `release_every` is reached. Call this regularly."""
-        if self._release_every is None:
-            return
-        now, phase = self.now_s, self.state.phase
-        if phase != self._phase:
-            self._phase = phase
-            self._next_s = now + self._release_every * self._random.uniform(0.25, 0.75)
-        if now >= self._next_s and phase != Phase.MOVING:
-            self.command("release" if phase == Phase.HELD else "hold")
-
     def receive(self, data: bytes = b"") -> bytes:
         """Pass bytes from the host to the LED controller and run its watchdog. Returns the bytes that it sends back."""
         with self._lock:
@@ -211,22 +188,29 @@ class Twin:
         start = end - constants.exposure_s
         with self._lock:
             light = self._lights.over(start, end)
-            self._lights.forget(start)
             seen = self.scene.at((start + end) / 2)
             self._frames += 1
         self._due_s = max(self._due_s, end + constants.lag_s + self._random.uniform(0, constants.jitter_s))
-        phase, trajectory, frame, pose = seen
-        exposure = Exposure(index, start, end, self._due_s, *light, phase, trajectory, frame, pose)
+        exposure = Exposure(
+            **vars(seen),
+            index=index,
+            start_s=start,
+            end_s=end,
+            due_s=self._due_s,
+            light=light.mean,
+            lowest=light.lowest,
+            highest=light.highest,
+        )
         image = self.blender.frame(self.scene.ends(seen, self.blender), light.mean)
         jpeg = photometry.encode(image, constants.jpeg_quality)
-        if self._jpegs is not None:
-            self._jpegs.write(jpeg)
-        if self._lines is not None:
-            self._lines.write(json.dumps(dataclasses.asdict(exposure)) + "\n")
+        if self._record is not None:
+            self._record.write(jpeg)
+        if self._log is not None:
+            self._log.write(json.dumps(dataclasses.asdict(exposure)) + "\n")
         return TwinFrame(exposure, jpeg)
 
     def step(self, seconds: float) -> None:
-        """Advance the virtual clock, with the controller's watchdog and the movements of `release_every`."""
+        """Advance the virtual clock, with the controller's watchdog."""
         if self._clock is not None:
             raise RuntimeError("this Twin runs on the real clock: read it through hardware.STS, or make a new Twin")
         if not 0 <= seconds < math.inf:
@@ -235,7 +219,6 @@ class Twin:
         while self._virtual_s < target:
             self._virtual_s = min(self._virtual_s + _TICK_S, target)
             self.receive()
-            self.operate()
 
     def capture(self) -> tuple[Exposure, UInt8[np.ndarray, "height width 3"]]:
         """Advance the virtual clock until the next frame is delivered. Returns its ground truth and its RGB image."""
@@ -249,40 +232,27 @@ class Twin:
     def set(self, levels: Sequence[int]) -> Lit:
         """Set the four levels (0 to 255), and advance the virtual clock by `ANSWER_S`. Returns the applied levels."""
         first, second, third, fourth = levels
-        return self._request(protocol.Set(self._next_sequence(), (first, second, third, fourth)))
+        return self._request(protocol.Set(next(self._sequence), (first, second, third, fourth)))
 
     def ping(self) -> Lit:
         """Ask for the levels, which keeps the lights on for another 1 s, and advance the clock by `ANSWER_S`."""
-        return self._request(protocol.Ping(self._next_sequence()))
+        return self._request(protocol.Ping(next(self._sequence)))
 
     def close(self) -> None:
-        """Stop the scene's rendering thread, and close the files of the log. Closing twice is allowed."""
-        self.scene.close()
+        """Close the files of the log. Closing twice is allowed."""
         self._files.close()
 
     def __enter__(self) -> "Twin":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _boot(self, now_s: float) -> None:
-        """Reset the controller, the lights and the camera at a time (s)."""
-        self._epoch_s = now_s
+        """Start the controller, the lights and the camera at a time (s)."""
+        self._epoch_s = now_s  # begin of the camera's first exposure
         self._controller = EmulatedController(now_s=now_s, serial_number=self.serial_number)
         self._lights = photometry.LightHistory(self.imperfections.rise_s)
-        self._sequence = 0
-        self._index = -1
-        self._frames = 0
-        self._due_s = -math.inf
-        self._phase = None
-        self._next_s = math.inf
-
-    def _next_sequence(self) -> int:
-        self._sequence = self._sequence % protocol.LAST_SEQUENCE + 1
-        return self._sequence
 
     def _request(self, request: protocol.Set | protocol.Ping) -> Lit:
         """Pass a request to the controller, which executes it after half of `ANSWER_S`."""

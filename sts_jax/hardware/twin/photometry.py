@@ -13,16 +13,18 @@ from jaxtyping import Float, UInt8, UInt16
 
 from sts_jax._checked import checked
 from sts_jax.hardware import protocol
-from sts_jax.hardware.lens import Lens, distorting_maps, plain
-from sts_jax.optics import Camera, to_linear, to_srgb
+from sts_jax.hardware.lens import Lens, distorted
+from sts_jax.optics import to_linear, to_srgb
+from sts_jax.sensor import Sensor
 
 _RISEN = 30.0  # time constants after which the target counts as reached, because exp(-30) is 1e-13
+_CHANGES = 4096  # remembered changes of the levels. A frame is made at most a few changes after its exposure
 _FULL = 65535  # uint16 value of full-scale linear light
 # Drawing noise for every frame is too slow, so one array of random numbers serves all frames. The array is longer than
 # a frame by this number, and each frame starts at another position in it.
 _SPARE = 1 << 20
 _STRIP = 1 << 18  # number of values that are processed at once, so that they stay in the processor's cache
-_MOST_SAMPLES = 3  # largest number of samples per raw pixel along each axis, unless it is given
+_MOST_SAMPLES = 3  # largest number of samples per raw pixel along each axis
 
 
 class Light(NamedTuple):
@@ -52,21 +54,17 @@ class LightHistory:
     """
 
     def __init__(self, rise_s: float = 0.0):
-        """Start with the lights off.
-
-        Args:
-            rise_s: Time constant tau, >= 0 (s). At 0, the brightness follows the levels at once.
-        """
+        """Start with the lights off, and with the time constant tau, `rise_s` (s). At 0, they follow at once."""
         self._rise_s = rise_s
         self._changes = [_Change(-math.inf, 0.0, 0.0)]
 
     def set(self, time_s: float, levels: protocol.Levels) -> None:
         """Record a change of the LED levels (0 to 255) at a time (s) that is not before the last change."""
         last, target = self._changes[-1], sum(levels) / (255 * len(levels))
-        if time_s < last.time_s:
-            raise ValueError(f"time_s must be at least {last.time_s} s, the time of the last change, got {time_s} s")
+        assert time_s >= last.time_s
         if target != last.target:
             self._changes.append(_Change(time_s, self._share(last, time_s), target))
+            del self._changes[:-_CHANGES]
 
     def over(self, start_s: float, end_s: float) -> Light:
         """Return the exact mean, the smallest and the largest brightness between two times (s)."""
@@ -84,11 +82,6 @@ class LightHistory:
             shares += [low, high]
         lowest, highest = min(shares), max(shares)
         return Light(min(max(integral / (end_s - start_s), lowest), highest), lowest, highest)
-
-    def forget(self, before_s: float) -> None:
-        """Delete the changes that `over` does not need for intervals from `before_s` (s) on."""
-        keep = bisect.bisect_right(self._changes, before_s, key=lambda change: change.time_s) - 1
-        del self._changes[:keep]
 
     def _share(self, change: _Change, time_s: float) -> float:
         """The share of the full power at a time after a change and before the next one."""
@@ -132,50 +125,26 @@ class Ends(NamedTuple):
     tactile: UInt16[np.ndarray, "height width 3"]  # image with the LEDs at full power
 
 
-class Warp(NamedTuple):
-    """The mapping from a rendered image to the raw image of a camera with lens distortion. `lens_warp` makes it."""
-
-    maps: tuple[np.ndarray, np.ndarray]  # maps for `cv2.remap`, with n x n samples per raw pixel, which are averaged
-    size: tuple[int, int]  # (height, width) of the raw image (pixels)
-
-    def apply(self, image: np.ndarray) -> np.ndarray:
-        """Convert a rendered image to the raw image. Raw pixels that show no part of it are 0."""
-        sampled = cv2.remap(image, *self.maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-        return cv2.resize(sampled, self.size[::-1], interpolation=cv2.INTER_AREA)
-
-
-def lens_warp(lens: Lens, pinhole: Camera, resolution: tuple[int, int], *, samples: int | None = None) -> Warp:
-    """Compute the mapping from a rendered image to the raw image of a fisheye lens.
-
-    Args:
-        lens: Fisheye camera whose raw image is wanted.
-        pinhole: Pinhole camera of the rendered view, such as `sts_jax.Sensor().camera`.
-        resolution: (height, width) of the rendered image (pixels).
-        samples: Number of samples along each axis of a raw pixel, which are averaged. None: the number that avoids
-            aliasing, but at most 3.
-    """
-    maps = distorting_maps(lens, plain(pinhole), resolution, samples, _MOST_SAMPLES)
-    return Warp(maps, (lens.height, lens.width))
-
-
 class Blender:
-    """Makes camera frames from the images of a scene with the LEDs off and at full power.
+    """The response of the camera: makes frames from the images of a scene with the LEDs off and at full power.
 
     `ends` converts both images once for each pose of the object. `frame` then makes frames, in one thread at a time.
     """
 
-    def __init__(self, imperfections: Imperfections, *, exposure: float = 1.0, warp: Warp | None = None, seed: int = 0):
+    def __init__(
+        self, imperfections: Imperfections, *, sensor: Sensor | None = None, lens: Lens | None = None, seed: int = 0
+    ):
         """Prepare the lookup tables.
 
         Args:
             imperfections: Deviations of the camera.
-            exposure: Exposure of the visual stream divided by that of the tactile stream (`Sensor.room.exposure`).
-            warp: Lens distortion. None: none.
+            sensor: Exposure and view of the scene's images. Default: `Sensor()`.
+            lens: Fisheye lens, whose raw images the frames are. Default: the frames are rectified.
             seed: Seed of the noise.
         """
-        self._imperfections = imperfections
-        self._exposure = exposure
-        self._warp = warp
+        sensor = Sensor() if sensor is None else sensor
+        self._imperfections, self._lens, self._pinhole = imperfections, lens, sensor.camera
+        self._exposure = float(sensor.room.exposure)
         self._rng = np.random.default_rng(seed)
         self._noise = np.zeros(0, np.float32)
         self._begin = 0
@@ -189,24 +158,18 @@ class Blender:
 
     @checked
     def ends(self, visual: Float[np.ndarray, "height width 3"], tactile: Float[np.ndarray, "height width 3"]) -> Ends:
-        """Convert the sRGB images of a scene to linear light, with lens distortion and vignetting.
-
-        Args:
-            visual: Image with the LEDs off (`Frame.visual`), in [0, 1].
-            tactile: Image with the LEDs at full power (`Frame.tactile`), in [0, 1].
-        """
+        """Convert the sRGB images of `Frame`, in [0, 1], to linear light, with lens distortion and vignetting."""
         return Ends(self._end(visual), self._end(tactile))
 
-    def blend(self, ends: Ends, light: float) -> UInt8[np.ndarray, "height width 3"]:
-        """Make a frame without noise at a mean brightness of the LEDs, 0 to 1.
-
-        Without leakage, vignetting and distortion, it equals the image of `sts_jax.expose` up to rounding.
-        """
-        return self._to_srgb[self._mixed(ends, light)]
-
     def frame(self, ends: Ends, light: float) -> UInt8[np.ndarray, "height width 3"]:
-        """Make a frame with noise at a mean brightness of the LEDs, 0 to 1."""
-        linear = self._mixed(ends, light).reshape(-1)
+        """Make a frame with noise at a mean brightness of the LEDs, 0 to 1.
+
+        Without imperfections and lens, it equals the image of `sts_jax.expose` up to rounding.
+        """
+        light = self._imperfections.leakage + (1 - self._imperfections.leakage) * light
+        bright = light * self._exposure
+        share = bright / (1 - light + bright)
+        linear = cv2.addWeighted(ends.visual, 1 - share, ends.tactile, share, 0).reshape(-1)
         if len(self._noise) < linear.size:
             self._noise = self._rng.standard_normal(linear.size + _SPARE, np.float32)
         self._begin = (self._begin + self._step) % _SPARE
@@ -221,18 +184,11 @@ class Blender:
             self._to_srgb.take(noisy.astype(np.uint16), out=out[begin : begin + part.size])
         return out.reshape(ends.visual.shape)
 
-    def _mixed(self, ends: Ends, light: float) -> np.ndarray:
-        """Blend both images by the equation of `sts_jax.expose`, in linear light, uint16."""
-        light = self._imperfections.leakage + (1 - self._imperfections.leakage) * light
-        bright = light * self._exposure
-        share = bright / (1 - light + bright)
-        return cv2.addWeighted(ends.visual, 1 - share, ends.tactile, share, 0)
-
     def _end(self, image: np.ndarray) -> np.ndarray:
         """Convert one sRGB image to linear light, uint16, and apply the lens distortion and the vignetting."""
         linear = self._to_linear[np.round(np.clip(image, 0, 1) * _FULL).astype(np.uint16)]
-        if self._warp is not None:
-            linear = self._warp.apply(linear)
+        if self._lens is not None:
+            linear = distorted(self._lens, self._pinhole, linear, outside=0, most_samples=_MOST_SAMPLES)
         if self._imperfections.vignetting:
             height, width = linear.shape[:2]
             rows, columns = (np.linspace(-1, 1, n, dtype=np.float32) if n > 1 else np.zeros(1) for n in (height, width))
@@ -250,7 +206,4 @@ def encode(image: UInt8[np.ndarray, "height width 3"], quality: int) -> bytes:
 
 def decode(data: bytes) -> UInt8[np.ndarray, "height width 3"]:
     """Decode a JPEG file to an RGB image."""
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
-    if image is None:
-        raise ValueError(f"data must be a JPEG image, but its {len(data)} bytes cannot be decoded")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    return cv2.cvtColor(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)

@@ -2,7 +2,9 @@
 
 import abc
 import bisect
+import dataclasses
 import enum
+import functools
 import math
 import threading
 from typing import NamedTuple
@@ -36,7 +38,8 @@ class Phase(enum.StrEnum):
     STILL = "still"  # the object is at rest, or has left the pad
 
 
-class Seen(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Seen:
     """The state of a scene at one time."""
 
     phase: Phase
@@ -51,7 +54,7 @@ class Scene(abc.ABC):
     `Twin` never calls `at` and `command` at the same time. The commands are `hold`, `release` and `clear`.
     """
 
-    exposure: float = 1.0  # exposure of the visual stream divided by that of the tactile stream (`Room.exposure`)
+    sensor: Sensor | None = None  # exposure and view of the images. None: `Sensor()`
 
     @abc.abstractmethod
     def at(self, time_s: float) -> Seen:
@@ -59,7 +62,7 @@ class Scene(abc.ABC):
 
     @abc.abstractmethod
     def ends(self, seen: Seen, blender: Blender) -> Ends:
-        """Return the images of the scene in the state `seen`, from `blender.ends`. They may be kept for later calls."""
+        """Return the images of the scene in the state `seen`, from `blender.ends`."""
 
     def prepare(self, command: str, blender: Blender) -> None:  # noqa: B027, few scenes need it
         """Render the images that a command will need. May be called from any thread."""
@@ -68,12 +71,6 @@ class Scene(abc.ABC):
         """Change the scene from a time on (s), which does not decrease between calls."""
         raise ValueError(f"command is {command!r}, but a {type(self).__name__} does not change: use an ObjectScene")
 
-    def start(self, blender: Blender) -> None:  # noqa: B027, few scenes need it
-        """Start a thread that renders images before a served twin needs them."""
-
-    def close(self) -> None:  # noqa: B027, few scenes need it
-        """Stop the thread that `start` has started, if there is one."""
-
 
 class Picture(Scene):
     """A scene that never changes, such as a calibration board: its sRGB images with the LEDs off and at full power."""
@@ -81,7 +78,7 @@ class Picture(Scene):
     def __init__(self, visual: np.ndarray, tactile: np.ndarray):
         """Store the images, in [0, 1], shape (height, width, 3)."""
         self._images = np.asarray(visual), np.asarray(tactile)
-        self._ends: tuple[Blender, Ends] | None = None
+        self._ends = functools.cache(lambda blender: blender.ends(*self._images))
 
     def at(self, time_s: float) -> Seen:
         """Return the only state."""
@@ -91,9 +88,7 @@ class Picture(Scene):
     def ends(self, seen: Seen, blender: Blender) -> Ends:
         """Return the two images, converted once."""
         del seen
-        if self._ends is None or self._ends[0] is not blender:
-            self._ends = blender, blender.ends(*self._images)
-        return self._ends[1]
+        return self._ends(blender)
 
 
 class _Motion(NamedTuple):
@@ -109,11 +104,10 @@ class _Motion(NamedTuple):
         frame = round(int(elapsed_s * motion_rate) * self.rate / motion_rate)
         return frame if elapsed_s * self.rate < self.rest and frame < self.rest else len(self.pose) - 1
 
-    def indices(self, motion_rate: float) -> list[int]:
-        """Indices of all rendered poses: the first pose, the last pose, then the poses of the motion."""
+    def all_drawn(self, motion_rate: float) -> set[int]:
+        """Indices of all poses that are rendered after the release."""
         steps = int(self.rest / self.rate * motion_rate) + 1
-        moving = [self.drawn(step / motion_rate, motion_rate) for step in range(steps)]
-        return list(dict.fromkeys([0, len(self.pose) - 1, *moving]))
+        return {len(self.pose) - 1, *(self.drawn(step / motion_rate, motion_rate) for step in range(steps))}
 
 
 class ObjectScene(Scene):
@@ -122,6 +116,8 @@ class ObjectScene(Scene):
     The pad is empty at first. The command `hold` places the object in the first pose of the next trajectory, `release`
     lets it go, and `clear` takes it away. Trajectories that end before the object has come to rest are skipped.
     """
+
+    sensor: Sensor
 
     def __init__(
         self,
@@ -138,20 +134,19 @@ class ObjectScene(Scene):
 
         Args:
             body: Object on the pad.
-            sensor: Constants of the sensor. Default: `Sensor()`, the paper's sensor.
+            sensor: Constants of the sensor. Default: `Sensor()`.
             scenario: Scenario of the trajectories. Default: `physics.Released()`.
             resolution: (height, width) of the rendered view (pixels).
-            motion_rate: Rendered poses per second of a moving object, > 0. Each pose is rendered once. Default: 10 for
-                views of up to 640 x 480 pixels, and proportionally fewer for larger views, but at least 1.
+            motion_rate: Rendered poses per second of a moving object. Default: 10 for views of up to 640 x 480 pixels,
+                and proportionally fewer for larger views, but at least 1.
             seed: Seed of the trajectories.
             first: Number of the first trajectory, to continue an earlier scene of the same seed.
         """
         if motion_rate is None:
             motion_rate = max(1.0, MOTION_RATE * min(1.0, _MOTION_PIXELS / math.prod(resolution)))
-        if not 0 < motion_rate < float("inf"):
+        if not 0 < motion_rate < math.inf:
             raise ValueError(f"motion_rate must be positive and finite, got {motion_rate}")
         self.sensor = Sensor() if sensor is None else sensor
-        self.exposure = float(self.sensor.room.exposure)
         self.scenario = physics.Released() if scenario is None else scenario
         self.scenario.check()
         self._body = body
@@ -163,8 +158,6 @@ class ObjectScene(Scene):
         self._motions: list[_Motion] = []  # all trajectories so far, which take a few kilobytes each
         self._rendered: dict[tuple[int, int], Ends] = {}  # images by trajectory and frame. (-1, 0) is the empty pad
         self._working = threading.Lock()  # lets one simulation or rendering run at a time
-        self._wake, self._stop = threading.Event(), threading.Event()
-        self._thread: threading.Thread | None = None
 
     def at(self, time_s: float) -> Seen:
         """Return the state of the scene at a time (s)."""
@@ -180,9 +173,7 @@ class ObjectScene(Scene):
 
     def ends(self, seen: Seen, blender: Blender) -> Ends:
         """Return the images of the object's pose, or of the empty pad. Each pose is rendered once."""
-        if seen.phase is Phase.EMPTY:
-            return self._render(-1, 0, blender)
-        return self._render(seen.trajectory, seen.frame, blender)
+        return self._render(-1 if seen.phase is Phase.EMPTY else seen.trajectory, seen.frame, blender)
 
     def prepare(self, command: str, blender: Blender) -> None:
         """Render the images that a command will need."""
@@ -191,7 +182,7 @@ class ObjectScene(Scene):
             case "hold":
                 self._render(number + 1, 0, blender)
             case "release" if number >= 0:
-                for frame in self._motion(number).indices(self._motion_rate):
+                for frame in self._motion(number).all_drawn(self._motion_rate):
                     self._render(number, frame, blender)
             case "clear":
                 self._render(-1, 0, blender)
@@ -214,51 +205,18 @@ class ObjectScene(Scene):
         del self._events[:-_EVENTS]
         for key in [key for key in self._rendered if 0 <= key[0] < self._events[-1][2] - 1]:
             del self._rendered[key]
-        self._wake.set()
-
-    def start(self, blender: Blender) -> None:
-        """Start a thread that renders images in advance: the empty pad, the current and the next trajectory."""
-        if self._thread is None:
-            self._stop.clear()
-            self._wake.set()
-            self._thread = threading.Thread(target=self._work, args=(blender,), name="twin's renderer", daemon=True)
-            self._thread.start()
-
-    def close(self) -> None:
-        """Stop the thread that `start` has started, after the image that it renders."""
-        self._stop.set()
-        self._wake.set()
-        if self._thread is not None:
-            self._thread.join()
-            self._thread = None
-
-    def _work(self, blender: Blender) -> None:
-        """Render the empty pad, the current trajectory and the next one, and start again after each command."""
-        while not self._stop.is_set():
-            self._wake.wait()
-            self._wake.clear()
-            number = self._events[-1][2]
-            for trajectory in (-1, number, number + 1):
-                indices = [0] if trajectory < 0 else self._motion(trajectory).indices(self._motion_rate)
-                for frame in indices:
-                    if self._stop.is_set() or self._wake.is_set():
-                        break
-                    self._render(trajectory, frame, blender)
 
     def _motion(self, number: int) -> _Motion:
         """The trajectory with a number, which is simulated if necessary."""
         if number < len(self._motions):  # before the lock, so that nobody waits for a rendering in another thread
             return self._motions[number]
         with self._working:
-            attempts = 0
+            unsettled = 0
             while len(self._motions) <= number:
                 settled = self._simulate()
-                attempts = 0 if settled else attempts + 1
-                if attempts == _ATTEMPTS:
-                    raise ValueError(
-                        f"the object did not come to rest in any of {_ATTEMPTS * _BATCH} simulated trajectories of "
-                        f"{self.scenario.frames} frames each: give the scenario more frames (scenario.frames)"
-                    )
+                unsettled = 0 if settled else unsettled + _BATCH
+                if unsettled == _ATTEMPTS * _BATCH:
+                    raise ValueError(f"none of {unsettled} simulated trajectories settled: increase scenario.frames")
                 self._motions += settled
             return self._motions[number]
 
@@ -274,18 +232,20 @@ class ObjectScene(Scene):
 
     def _render(self, trajectory: int, frame: int, blender: Blender) -> Ends:
         """The images of one pose without light and at full light, rendered or from the cache."""
-        if (ends := self._rendered.get((trajectory, frame))) is not None:
-            return ends
         pose, wrench = _NOWHERE, np.zeros(6, np.float32)
         if trajectory >= 0:
             motion = self._motion(trajectory)
             pose, wrench = motion.pose[frame], motion.wrench[frame]
+        if (ends := self._rendered.get((trajectory, frame))) is not None:
+            return ends
         with self._working:
-            if (ends := self._rendered.get((trajectory, frame))) is not None:
-                return ends
-            images = sense(self.sensor, self._body, jnp.asarray(pose), jnp.asarray(wrench), resolution=self._resolution)
-            ends = blender.ends(np.asarray(images.visual), np.asarray(images.tactile))
-            self._rendered[trajectory, frame] = ends
+            ends = self._rendered.get((trajectory, frame))  # another thread may have rendered it meanwhile
+            if ends is None:
+                images = sense(
+                    self.sensor, self._body, jnp.asarray(pose), jnp.asarray(wrench), resolution=self._resolution
+                )
+                ends = blender.ends(np.asarray(images.visual), np.asarray(images.tactile))
+                self._rendered[trajectory, frame] = ends
             return ends
 
 

@@ -6,14 +6,11 @@ import json
 import os
 import select
 import socket
-import termios
 import threading
 import time
 import tty
 from collections import deque
-from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
 
 from sts_jax.hardware import web
 from sts_jax.hardware.twin.device import Twin, TwinFrame
@@ -22,20 +19,14 @@ CAMERA = "/camera"
 COMMANDS = ("hold", "release", "clear")
 _WAIT_S = 0.1  # longest time until waiting threads notice that they must stop (s)
 _TICK_S = 0.003  # longest wait for bytes, after which the watchdog is checked (s)
-_OPERATE_S = 0.05  # period with which `release_every` is checked (s)
-_SPEED = termios.B115200  # baud rate of the protocol
 _BUFFER = 1 << 16  # size of a connection's send buffer (bytes). With a larger one, a slow client gets older frames
 _KEPT = 32  # largest number of frames that wait for their delivery
 
 
-class LedPort:
-    """A pseudo-terminal that acts as the serial port of the twin's LED controller. A thread answers the requests.
-
-    As on a real serial line, a host at another rate than 115200 baud receives unreadable bytes.
-    """
+class _LedPort:
+    """A pseudo-terminal that acts as the serial port of the twin's LED controller. It has any baud rate."""
 
     def __init__(self, twin: Twin, link: str | os.PathLike | None = None):
-        """Open the pseudo-terminal and start the thread. `link` is as in `Served`."""
         self._twin = twin
         self._link = None if link is None else Path(link)
         if self._link is not None and self._link.exists() and not self._link.is_symlink():
@@ -45,81 +36,46 @@ class LedPort:
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
         self._name = os.ttyname(self._slave)
+        self.device = self._name if self._link is None else str(self._link)
         if self._link is not None:
             try:
                 self._link.unlink(missing_ok=True)
                 self._link.symlink_to(self._name)
             except OSError:
-                self._close()
+                self.close()
                 raise
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._serve, name="twin's LED port", daemon=True)
-        self._thread.start()
 
-    @property
-    def device(self) -> str:
-        """Path of the port: the symbolic link if there is one, else the pseudo-terminal."""
-        return self._name if self._link is None else str(self._link)
+    def serve(self, stop: threading.Event) -> None:
+        """Answer requests until the event is set."""
+        while not stop.is_set():
+            readable = select.select([self._master], [], [], _TICK_S)[0]
+            data = os.read(self._master, 4096) if readable else b""
+            if answer := self._twin.receive(data):
+                with contextlib.suppress(BlockingIOError):  # no host reads, and the buffer of the line is full
+                    os.write(self._master, answer)
 
     def close(self) -> None:
-        """End the thread, close the pseudo-terminal, and remove the symbolic link if there is one."""
-        self._stop.set()
-        self._thread.join()
-        self._close()
-
-    def _close(self) -> None:
+        """Close the pseudo-terminal, and remove the symbolic link if there is one."""
         if self._link is not None and self._link.is_symlink() and os.readlink(self._link) == self._name:
             self._link.unlink()
         for descriptor in (self._master, self._slave):
             os.close(descriptor)
 
-    def _serve(self) -> None:
-        while not self._stop.is_set():
-            readable = select.select([self._master], [], [], _TICK_S)[0]
-            self._send(self._twin.receive())
-            if readable:
-                with contextlib.suppress(BlockingIOError):
-                    data = os.read(self._master, 4096)
-                    attributes = termios.tcgetattr(self._slave)
-                    right_speed = attributes[4] == attributes[5] == _SPEED
-                    self._send(self._twin.receive(data) if right_speed else b"\xff" * len(data))
 
-    def _send(self, data: bytes) -> None:
-        """Send bytes to the host. If no host reads and the buffer of the line is full, they are lost."""
-        if data:
-            with contextlib.suppress(BlockingIOError):
-                os.write(self._master, data)
+class _Camera:
+    """Produces the frames of a twin while at least one client is connected."""
 
-
-class CameraThread:
-    """A thread that produces the frames of a twin while at least one client is connected."""
-
-    def __init__(self, twin: Twin):
-        """Start the thread."""
-        self.twin = twin
+    def __init__(self, twin: Twin, stop: threading.Event):
+        self.twin, self.stop = twin, stop
         self._frames: deque[TwinFrame] = deque(maxlen=_KEPT)
         self._changed = threading.Condition()
         self._clients = 0
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="twin's camera", daemon=True)
-        self._thread.start()
 
-    @property
-    def stopped(self) -> bool:
-        """True after `close` was called."""
-        return self._stop.is_set()
-
-    @contextlib.contextmanager
-    def client(self) -> Iterator[None]:
-        """Register a client for the duration of the `with` block."""
+    def add_clients(self, number: int) -> None:
+        """Count connected clients, with -1 for one that has gone."""
         with self._changed:
-            self._clients += 1
+            self._clients += number
             self._changed.notify_all()
-        try:
-            yield
-        finally:
-            with self._changed:
-                self._clients -= 1
 
     def following(self, index: int) -> TwinFrame | None:
         """Return the newest frame after a number that is due, or else the first one that will be due.
@@ -135,16 +91,10 @@ class CameraThread:
         due = [frame for frame in later if frame.exposure.due_s <= now]
         return due[-1] if due else later[0] if later else None
 
-    def close(self) -> None:
-        """Stop the thread."""
-        self._stop.set()
-        with self._changed:
-            self._changed.notify_all()
-        self._thread.join()
-
-    def _run(self) -> None:
+    def run(self) -> None:
+        """Produce frames until the event `stop` is set."""
         twin, index = self.twin, -1
-        while not self._stop.is_set():
+        while not self.stop.is_set():
             with self._changed:
                 if not self._clients:
                     self._changed.wait(_WAIT_S)
@@ -152,7 +102,7 @@ class CameraThread:
             # If this thread is late, it skips frames, as a real camera does.
             index = max(index + 1, int((twin.now_s - twin.end_s(0)) * twin.rate))
             while (wait_s := twin.end_s(index) - twin.now_s) > 0:
-                if self._stop.wait(wait_s):
+                if self.stop.wait(wait_s):
                     return
             frame = twin.make(index)
             with self._changed:
@@ -161,18 +111,9 @@ class CameraThread:
 
 
 class _Server(web.Server):
-    daemon_threads = False  # `server_close` waits for the threads of all connections
-
-    def __init__(self, host: str, port: int, camera: CameraThread):
+    def __init__(self, host: str, port: int, camera: _Camera):
         self.camera = camera
-        self.connections: set[socket.socket] = set()
         super().__init__(host, port, _Handler)
-
-    def server_close(self) -> None:
-        for connection in list(self.connections):
-            with contextlib.suppress(OSError):  # it is closed already
-                connection.shutdown(socket.SHUT_RDWR)
-        super().server_close()
 
 
 class _Handler(web.Handler):
@@ -206,24 +147,18 @@ class _Handler(web.Handler):
     def _stream(self) -> None:
         """Send each frame when it is due. A client that reads too slowly misses frames."""
         camera, index = self.server.camera, -1
-        with camera.client(), contextlib.suppress(OSError):  # the client may go away
+        self.request.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
+        camera.add_clients(1)
+        try:
             self.begin_stream()
-            while not camera.stopped:
+            while not camera.stop.is_set():
                 frame = camera.following(index)
                 if frame is not None:
                     time.sleep(max(0.0, frame.exposure.due_s - camera.twin.now_s))
                     self.send_frame(frame.jpeg)
                     index = frame.exposure.index
-
-    def setup(self) -> None:
-        self.server.connections.add(self.request)
-        self.request.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
-        super().setup()
-
-    def finish(self) -> None:
-        self.server.connections.discard(self.request)
-        with contextlib.suppress(OSError):  # the client has gone
-            super().finish()
+        finally:
+            camera.add_clients(-1)
 
 
 class Served:
@@ -251,37 +186,23 @@ class Served:
             http_port: TCP port of the HTTP server. 0 selects a free one.
         """
         twin.run_on(time.monotonic)
-        self._twin = twin
-        with contextlib.ExitStack() as opened:
-            self._camera = CameraThread(twin)
-            opened.callback(self._camera.close)
-            self._web = _Server(host, http_port, self._camera)
-            opened.callback(self._web.server_close)
-            self._leds = LedPort(twin, link)
-            opened.pop_all()
-        twin.scene.start(twin.blender)
         self._stop = threading.Event()
+        camera = _Camera(twin, self._stop)
+        with contextlib.ExitStack() as opened:
+            self._web = _Server(host, http_port, camera)
+            opened.callback(self._web.server_close)
+            self._leds = _LedPort(twin, link)
+            opened.pop_all()
+        self.port = self._leds.device  # name of the serial port of the LED controller
+        self.url = self._web.url  # URL of the HTTP server, such as `http://127.0.0.1:45253`
+        self.camera = self.url + CAMERA  # URL of the camera stream, for `cv2.VideoCapture`
         self._threads = [
             threading.Thread(target=self._web.serve_forever, args=(0.05,), name="twin's HTTP server", daemon=True),
-            threading.Thread(target=self._operate, name="twin's hand", daemon=True),
+            threading.Thread(target=camera.run, name="twin's camera", daemon=True),
+            threading.Thread(target=self._leds.serve, args=(self._stop,), name="twin's LED port", daemon=True),
         ]
         for thread in self._threads:
             thread.start()
-
-    @property
-    def port(self) -> str:
-        """Name of the serial port of the LED controller."""
-        return self._leds.device
-
-    @property
-    def url(self) -> str:
-        """URL of the HTTP server, such as `http://127.0.0.1:45253`."""
-        return self._web.url
-
-    @property
-    def camera(self) -> str:
-        """URL of the camera stream, for `cv2.VideoCapture`."""
-        return self.url + CAMERA
 
     @property
     def description(self) -> str:
@@ -299,26 +220,18 @@ class Served:
         )
 
     def close(self) -> None:
-        """Stop all threads, close the serial port and all sockets, and remove the link. Closing twice is allowed."""
+        """Stop all threads, close the serial port and the server, and remove the link. Closing twice is allowed."""
         if self._stop.is_set():
             return
         self._stop.set()
-        self._camera.close()
         self._web.shutdown()
         self._web.server_close()
-        self._leds.close()
-        self._twin.scene.close()
         for thread in self._threads:
             thread.join()
+        self._leds.close()
 
     def __enter__(self) -> "Served":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
-
-    def _operate(self) -> None:
-        while not self._stop.wait(_OPERATE_S):
-            self._twin.operate()

@@ -35,7 +35,7 @@ class _Device:
         image.flags.writeable = False
         time_s = self._twin.now_s
         self.ping()  # keeps the lights on, as the thread of `hardware.Leds` does
-        return Captured(image, time_s, exposure.index, epoch=0, dropped=0, repeats=0)
+        return Captured(image, time_s, exposure.index)
 
     def monotonic(self) -> float:
         return self._twin.now_s
@@ -45,15 +45,7 @@ class _Device:
 
 
 class VirtualSensor:
-    """Reads pairs from a `Twin` on its virtual clock. `hardware.collect` accepts it in place of `hardware.STS`.
-
-    ```python
-    body = sts_jax.objects.make(jax.random.key(0), "bottle")
-    with Twin(ObjectScene(body)) as twin:
-        sensor = VirtualSensor(twin)
-        pair = sensor.read()
-    ```
-    """
+    """Reads pairs from a `Twin` on its virtual clock. `hardware.collect` accepts it in place of `hardware.STS`."""
 
     def __init__(self, twin: Twin, *, levels: Sequence[int] = (255, 255, 255, 255), settling: Settling | None = None):
         """Connect to a twin, and measure its settling times unless they are given. The scene must then be at rest.
@@ -63,25 +55,15 @@ class VirtualSensor:
             levels: Duty cycles of the four LED channels in the tactile stream, 0 to 255.
             settling: Settling times of an earlier measurement.
         """
-        device = _Device(twin)
         self.levels: protocol.Levels = checked_levels(levels)
-        self._twin = twin
-        self._frames = ProvenFrames(
-            device,
-            device,
-            levels=self.levels,
-            exposures=None,
-            timeout_s=_TIMEOUT_S,
-            reconnect_s=_TIMEOUT_S,
-            clock=device,
-        )
+        self._twin, device = twin, _Device(twin)
+        limits = {"timeout_s": _TIMEOUT_S, "reconnect_s": _TIMEOUT_S}
+        self._frames = ProvenFrames(device, device, levels=self.levels, exposures=None, clock=device, **limits)
         height, width, _ = twin.capture()[1].shape
         self.origin = Origin(CAMERA, twin.serial_number, width, height, self.levels)  # for `hardware.Session`
-        if settling is None:
-            self.settling = self._frames.measure_settling(_SWITCHES, _WATCH_S)
-        else:
-            self.settling = settling
+        if settling is not None:
             self._frames.see_both(settling)
+        self.settling = self._frames.measure_settling(_SWITCHES, _WATCH_S) if settling is None else settling
 
     def read(self) -> Pair:
         """Take a visual and a tactile image, whose frames arrive after the start of this call."""
@@ -97,13 +79,7 @@ class Hand(AutomaticPerson):
     """
 
     def __init__(self, twin: Twin, session: Session, *, patience_s: float = 60.0):
-        """Prepare the hand.
-
-        Args:
-            twin: Twin whose object the hand moves.
-            session: Session that receives the trajectories.
-            patience_s: Longest time without a new instruction, > 0 (s on the twin's clock).
-        """
+        """Prepare the hand, which waits for a new instruction for at most `patience_s` (s on the twin's clock)."""
         super().__init__()
         self._twin, self._session = twin, session
         self._patience_s = patience_s
@@ -116,10 +92,9 @@ class Hand(AutomaticPerson):
     def show(self, view: View) -> None:
         """Move the object as the newest instruction requires. Raises an error if the collection does not go on."""
         super().show(view)
-        entered, self._seen = view.stage is not self._seen, view.stage
         self._now_s = self._twin.now_s
-        if entered or view.problem is not None:
-            self._since_s = self._now_s
+        if view.stage is not self._seen or view.problem is not None:
+            self._seen, self._since_s = view.stage, self._now_s
         if view.problem is not None and self._held_s is not None:
             self._held_s = self._now_s
         match view.stage:
@@ -133,9 +108,8 @@ class Hand(AutomaticPerson):
                 self._held_s, self._unseen = None, 0
         if self._now_s - self._since_s > self._patience_s or self._unseen == _UNSEEN:
             raise ValueError(
-                f"hardware.collect has shown `{view.instruction}` for {self._now_s - self._since_s:.1f} s (contact: "
-                f"{view.contact}, still: {view.still}), and {self._unseen} held poses in a row had no visible contact: "
-                f"change its config (GuideConfig), or increase patience_s ({self._patience_s:g} s)"
+                f"no progress after `{view.instruction}` for {self._now_s - self._since_s:.1f} s and {self._unseen} "
+                f"held poses without visible contact (contact: {view.contact}, still: {view.still}): change GuideConfig"
             )
 
     def action(self) -> Action | None:
