@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 import sts_jax as sts
 from sts_jax import hardware
-from sts_jax.hardware import Board, CalibrationError, Lens, calibrate
+from sts_jax.hardware import Board, Lens, calibrate
 
 PINHOLE = sts.Sensor().camera
 BOARD = Board()

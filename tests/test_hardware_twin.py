@@ -148,19 +148,6 @@ def test_log_agrees_with_the_acknowledged_lights_and_repeats_with_the_seed(tmp_p
     np.testing.assert_array_equal(images, same)
 
 
-def test_watchdog_turns_the_virtual_lights_off():
-    with twin.Twin(picture()) as device:
-        device.set(ON)
-        device.step(0.9)
-        assert device.ping().levels == ON
-        device.step(1.1)
-        lit = device.ping()
-        assert lit.levels == OFF
-        assert lit.counter == 2
-        device.step(0.2)
-        assert device.capture()[0].light == 0
-
-
 def used():
     device = twin.Twin(picture())
     device.step(1.0)
