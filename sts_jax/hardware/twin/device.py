@@ -45,13 +45,10 @@ class Exposure(Seen):
 
 @dataclasses.dataclass(frozen=True)
 class State(Seen):
-    """The scene, the lights and the camera at one time."""
+    """The scene and the lights at one time."""
 
     now_s: float  # time on the twin's clock (s)
     levels: protocol.Levels  # duty cycles of the four LED channels, 0 to 255
-    counter: int  # number of changes of the levels since the controller's boot
-    boot: int  # number of the controller's boot
-    frames: int  # number of frames produced so far
 
 
 class TwinFrame(NamedTuple):
@@ -114,7 +111,6 @@ class Twin:
         self._virtual_s = 0.0
         self._sequence = itertools.cycle(range(1, protocol.LAST_SEQUENCE + 1))  # numbers of requests
         self._index = -1  # number of the last frame that `capture` returned
-        self._frames = 0  # number of frames produced so far
         self._due_s = -math.inf  # time of delivery of the last frame
         with contextlib.ExitStack() as files:
             self._log = None if log is None else files.enter_context(Path(log).open("w", buffering=1))
@@ -129,17 +125,10 @@ class Twin:
 
     @property
     def state(self) -> State:
-        """The current state of the scene, the lights and the camera."""
+        """The current state of the scene and the lights."""
         with self._lock:
-            now, leds = self.now_s, self._controller
-            return State(
-                **vars(self.scene.at(now)),
-                now_s=now,
-                levels=leds.levels,
-                counter=leds.counter,
-                boot=leds.boot,
-                frames=self._frames,
-            )
+            now = self.now_s
+            return State(**vars(self.scene.at(now)), now_s=now, levels=self._controller.levels)
 
     def run_on(self, clock: Callable[[], float]) -> None:
         """Replace the virtual clock, which must not have advanced, by a function such as `time.monotonic`."""
@@ -189,7 +178,6 @@ class Twin:
         with self._lock:
             light = self._lights.over(start, end)
             seen = self.scene.at((start + end) / 2)
-            self._frames += 1
         self._due_s = max(self._due_s, end + constants.lag_s + self._random.uniform(0, constants.jitter_s))
         exposure = Exposure(
             **vars(seen),
