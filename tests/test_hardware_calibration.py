@@ -182,9 +182,9 @@ def corners_of(lens, poses, noise, rng, project=None):
 
 
 def pad_points():
-    """Points all over the pad (m), shape (81, 3)."""
-    x, y = np.meshgrid(np.linspace(-0.075, 0.075, 9), np.linspace(-0.075, 0.075, 9))
-    return np.stack([x.ravel(), y.ravel(), np.zeros(81)], axis=-1)
+    """Points all over the pad (m), shape (64, 3)."""
+    x, y = np.meshgrid(np.linspace(-0.075, 0.075, 8), np.linspace(-0.075, 0.075, 8))
+    return np.stack([x.ravel(), y.ravel(), np.zeros(64)], axis=-1)
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 4))])

@@ -131,7 +131,7 @@ def test_a_settling_that_is_too_short_gives_no_image():
         twin.VirtualSensor(made, settling=Settling(visual_s=0.01, tactile_s=0.01)).read()
 
 
-def test_an_image_whose_light_another_program_switched_is_not_returned(logged, monkeypatch):
+def test_an_image_whose_light_another_program_switched_is_not_returned(monkeypatch):
     with Logged(picture(), rate=15) as made:
         sensor = twin.VirtualSensor(made)
         capture, calls = made.capture, []
