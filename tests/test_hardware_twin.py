@@ -348,10 +348,8 @@ def test_commands_and_state_over_http(held):
 
 def test_watchdog_turns_the_lights_off_after_the_host_has_gone(served):
     device, server = served
-    text = "1 SET 255 255 255 255"
-    line = f"{text}*{protocol.checksum(text.encode()):04X}\n".encode()
     with serial.Serial(server.port, 115200, timeout=30) as port:
-        port.write(line)
+        port.write(protocol.encode("1 SET 255 255 255 255"))
         assert port.readline().startswith(b"1 OK SET 255 255 255 255")
         assert port.readline().startswith(b"0 OFF watchdog 2")
     assert device.state.levels == OFF
