@@ -336,11 +336,9 @@ class OpenCVCamera:
             counted = 0 if limit_s is None else repeats
             frame = previous = Captured(image, time_s, sequence, self._epoch, dropped, counted, delayed)
             if counted and not frame.black and limit_s is not None and time_s - same_since > limit_s:
-                message = (
-                    f"{config.name} has sent the same image for {time_s - same_since:.1f} s: replug the camera, or "
-                )
-                message += "restart its server. If it may repeat images, set frozen_after_s=None in CameraConfig."
-                self._set_problem(FrozenCameraError, message)
+                message = f"{config.name} has sent the same image for {time_s - same_since:.1f} s"
+                remedy = "replug it or restart its server, or set frozen_after_s=None if it may repeat images"
+                self._set_problem(FrozenCameraError, f"{message}: {remedy}.")
                 continue
             self._publish(frame)
             if (task := self._task) is not None:

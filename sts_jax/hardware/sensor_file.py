@@ -6,7 +6,6 @@
 import dataclasses
 import io
 import os
-import re
 import shutil
 from pathlib import Path
 from typing import Annotated, Literal
@@ -17,7 +16,7 @@ from PIL import Image
 from pydantic import Field
 
 from sts_jax import storage
-from sts_jax.hardware.camera import CameraConfig
+from sts_jax.hardware.camera import CameraConfig, public
 from sts_jax.hardware.lens import Lens
 from sts_jax.sensor import Sensor
 
@@ -54,7 +53,7 @@ class Device:
     lens_from: Literal["board", "ideal"] = "board"  # calibrated from images of a board, or assumed as `Lens.ideal`
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "camera", _public(self.camera))
+        object.__setattr__(self, "camera", public(self.camera))
 
     @property
     def width(self) -> int:
@@ -135,8 +134,8 @@ class Device:
     def check_identity(self, *, camera: str | None = None, leds: str | None = None) -> None:
         """Raise a ValueError if the given camera (path or URL) or controller (serial number) is another one."""
         different = []
-        if camera is not None and _public(camera) != self.camera:
-            different.append(f"camera {_public(camera)}")
+        if camera is not None and public(camera) != self.camera:
+            different.append(f"camera {public(camera)}")
         if leds is not None and leds != self.leds:
             different.append(f"LED controller {leds}")
         if different:
@@ -179,8 +178,3 @@ def checksums(path: str | os.PathLike) -> dict[str, str]:
     names = [file.name, *(name for name in BACKGROUNDS if name in manifest.files)]
     storage.verify(file.parent, manifest, _AGAIN, names)
     return {name: manifest.files[name] for name in names}
-
-
-def _public(source: str) -> str:
-    """The path or URL of a camera without a user name and a password."""
-    return re.sub(r"(?<=://)[^/@]*@", "", source)
