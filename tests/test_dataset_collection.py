@@ -6,16 +6,7 @@ import pytest
 import sts_jax as sts
 from sts_jax import dataset
 
-SMALL = dataset.Collection(num_objects=4, num_per_object=2, num_full=1, objects_per_shard=2)
-
-
-def test_every_object_is_in_one_part_and_shares_are_kept():
-    collection = dataset.Collection(num_objects=160)
-    split = dataset.split_objects(collection)
-    assert {name: len(part) for name, part in split.items()} == {"train": 112, "validation": 16, "test": 32}
-    np.testing.assert_array_equal(np.sort(np.concatenate(list(split.values()))), np.arange(160))
-    for part in split.values():  # each category alike
-        np.testing.assert_array_equal(np.bincount(part % 8, minlength=8), len(part) // 8)
+SMALL = dataset.Collection(num_objects=4, num_per_object=2, num_full=1, objects_per_shard=2, symmetries=False)
 
 
 def test_the_split_of_published_collections_is_unchanged():
@@ -24,7 +15,7 @@ def test_the_split_of_published_collections_is_unchanged():
     assert split["test"].tolist() == [2, 3, 8, 9]
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_classes_of_different_sizes_have_equal_proportions_in_all_parts(seed):
     labels = ("mug",) * 100 + ("bowl",) * 10 + ("fork",)
     meshes = dataset.Meshes("meshes", tuple(f"{i}.stl" for i in range(111)), labels, "")
@@ -47,27 +38,22 @@ def test_classes_follow_the_categories():
         assert sum(names[i] == "fork" for i in part) == len(part) / 2
 
 
-def narrow():
-    gel = dataclasses.replace(sts.Sensor().gel, size=(0.15, 0.1))
-    return dataclasses.replace(sts.Sensor(), gel=gel)
-
-
 @pytest.mark.parametrize(
-    ("changes", "sensor", "message"),
+    ("changes", "message"),
     [
-        ({"num_rendered": 3}, sts.Sensor, r"num_rendered must be None or from 1 to num_per_object=2, got 3"),
-        ({"num_rendered": True}, sts.Sensor, r"num_rendered must be .* got True"),
-        ({"num_views": -1}, sts.Sensor, r"num_views must be a whole number of at least 0, got -1"),
-        ({"num_objects": 0}, sts.Sensor, r"num_objects must be a whole number of at least 1, got 0"),
-        ({"num_per_object": True}, sts.Sensor, r"num_per_object must be a whole number of at least 1, got True"),
-        ({"resolution": (64, 0)}, sts.Sensor, r"resolution must be two whole numbers .* got \(64, 0\)"),
-        ({"categories": ()}, sts.Sensor, r"categories is empty, but it must name at least one class"),
-        ({"categories": ("bottle", "cup")}, sts.Sensor, r"category is 'cup', but it must be one of bottle, camera"),
-        ({"shares": (0.5, 0.5, 0.5)}, sts.Sensor, r"shares=\(0\.5, 0\.5, 0\.5\), but .* sum 1"),
-        ({"symmetries": True}, narrow, r"gel\.size=\[0\.15"),
+        ({"num_rendered": 3}, r"num_rendered must be None or from 1 to num_per_object=2, got 3"),
+        ({"num_views": -1}, r"num_views must be a whole number of at least 0, got -1"),
+        ({"num_objects": 0}, r"num_objects must be a whole number of at least 1, got 0"),
+        ({"resolution": (64, 0)}, r"resolution must be two whole numbers .* got \(64, 0\)"),
+        ({"categories": ()}, r"categories is empty, but it must name at least one class"),
+        ({"categories": ("bottle", "cup")}, r"category is 'cup', but it must be one of bottle, camera"),
+        ({"shares": (0.5, 0.5, 0.5)}, r"shares=\(0\.5, 0\.5, 0\.5\), but .* sum 1"),
+        ({"symmetries": True}, r"gel\.size=\[0\.15"),
     ],
 )
-def test_fields_out_of_range_are_refused_before_anything_is_written(tmp_path, changes, sensor, message):
+def test_fields_out_of_range_are_refused_before_anything_is_written(tmp_path, changes, message):
+    oblong = sts.Sensor(gel=sts.tactile.Gel(size=(0.15, 0.1)))  # without quarter turns
     with pytest.raises(ValueError, match=message):
-        dataset.collect(dataclasses.replace(SMALL, **changes), sensor(), tmp_path / "new")
+        dataset.collect(dataclasses.replace(SMALL, **changes), oblong, tmp_path / "new")
     assert not (tmp_path / "new").exists()
+    dataclasses.replace(SMALL, scenario=sts.physics.Inclined(), symmetries=True).check(oblong)  # no quarter turns

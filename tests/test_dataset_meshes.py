@@ -87,10 +87,11 @@ def test_one_mesh_under_several_names_is_one_object(tmp_path):
     assert "c.obj: the same mesh as a.stl, left out\n" in listing
 
 
-def test_an_object_that_cannot_be_simulated_is_left_out_and_the_others_are_collected(
+def test_objects_that_are_gone_or_cannot_be_simulated_are_left_out_and_the_others_are_collected(
     folder, tmp_path_factory, monkeypatch
 ):
     one = collection(dataset.survey_meshes(folder, SCENARIO)[0])
+    (folder / "can" / "1.stl").unlink()
     simulate = physics.simulate
 
     def stumbles(key, bodies, *args, **kwargs):
@@ -102,28 +103,20 @@ def test_an_object_that_cannot_be_simulated_is_left_out_and_the_others_are_colle
     monkeypatch.setattr(physics, "simulate", stumbles)
     out = tmp_path_factory.mktemp("out") / "dataset"
     made = dataset.collect(one, sts.Sensor(), out)
-    assert made.left_out == ("object 1 (box/1.stl): trajectory 0 is non-finite",)
+    stumbled, gone = made.left_out
+    assert stumbled == "object 1 (box/1.stl): trajectory 0 is non-finite"
+    assert gone.startswith("object 4 (can/1.stl): ")
+    assert "no longer has can/1.stl: restore" in gone
     assert dataset.collect(one, sts.Sensor(), out) == made  # nothing is left to do, and the result is the same
     data = dataset.load(out)
-    np.testing.assert_array_equal(data.trajectory["body"], [0, 2, 3, 4, 5])
-    pairs = data.pairs(np.arange(5))
-    for row, number in enumerate(data.trajectory["body"]):
-        body = dataset.make_bodies(one, np.array([number]))[0]
+    np.testing.assert_array_equal(data.trajectory["body"], [0, 2, 3, 5])
+    pairs = data.pairs(np.arange(4))
+    bodies = dataset.make_bodies(one, data.trajectory["body"])
+    for row, (body, wrench) in enumerate(zip(bodies, data.trajectory["wrench"], strict=True)):
         shown = dataset.render_uint8(
-            sts.Sensor(), body, pairs.pose[row, :1], data.trajectory["wrench"][row, :1], resolution=(64, 64), crop=False
+            sts.Sensor(), body, pairs.pose[row, :1], wrench[:1], resolution=(64, 64), crop=False
         )
         assert np.mean(np.asarray(shown[0][0]) != pairs.visual[row, 0]) < 0.01
-
-
-def test_a_file_deleted_after_the_survey_is_left_out(folder, tmp_path_factory):
-    one = collection(dataset.survey_meshes(folder, SCENARIO)[0])
-    out = tmp_path_factory.mktemp("out") / "dataset"
-    (folder / "can" / "1.stl").unlink()
-    made = dataset.collect(one, sts.Sensor(), out)
-    (line,) = made.left_out
-    assert line.startswith("object 4 (can/1.stl): ")
-    assert "no longer has can/1.stl: restore" in line
-    np.testing.assert_array_equal(dataset.load(out).trajectory["body"], [0, 1, 2, 3, 5])
 
 
 def test_a_folder_without_usable_objects_and_a_wrong_number_are_refused(folder, tmp_path):

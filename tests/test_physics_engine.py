@@ -8,32 +8,22 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from physics_scenes import PAD, box
 
 from sts_jax import objects, physics
 from sts_jax.physics import native, roll, scene
 from sts_jax.physics.scenario import STANDING, G, Start
 from sts_jax.sensor import Sensor
 
-PAD = (0.15, 0.15)
 BODIES = [objects.make(jax.random.key(i), name) for i, name in enumerate(["bottle", "fork", "watch"])]
-FIELDS = ("pose", "velocity", "wrench", "contact", "wall", "settled", "touches", "sunk")
 simulate = functools.partial(physics.simulate, jax.random.key(3), sensor=Sensor(), engine="mujoco")
 
 
 def plain_loop(
-    model: mujoco.MjModel,
-    points: np.ndarray,
-    pose: np.ndarray,
-    gravity: np.ndarray,
-    held: int,
-    velocity: np.ndarray,
-    *,
-    as_force: bool,
+    model: mujoco.MjModel, points: np.ndarray, start: Start, gravity: np.ndarray, velocity: np.ndarray, as_force: bool
 ) -> dict:
-    """One trajectory, step by step as `roll.step` defines it.
-
-    Gravity is MuJoCo's own, or its change is a force on the centre of mass.
-    """
+    """One trajectory as `roll.step` defines it. Gravity is MuJoCo's own, or its change is a force on the object."""
+    (pose,), (held,) = start.pose, start.held
     data = mujoco.MjData(model)
     force = data.body("object").xfrc_applied[:3]
     mass, base = model.body("object").mass[0], gravity[-1, -1]
@@ -76,18 +66,17 @@ def plain_loop(
         frames["wrench"].append(impulse / max(loaded, 1))
         frames["contact"].append(loaded > 0)
         frames["wall"].append(wall)
-    found = {name: np.array(rows) for name, rows in frames.items()}
-    return {**found, "slow": slow, "touches": touches, "gone": gone}
+    return {name: np.array(rows) for name, rows in frames.items()} | {"slow": slow, "touches": touches, "gone": gone}
 
 
 ON_PAD = -float(BODIES[0].hulls[..., 2].min()) - STANDING
 CASES = {
-    "lands and rests": (physics.Freefall(), [0.01, 0.0, 0.06, 0.96, 0.2, 0.1, 0.17], 32),
+    "lands and rests": (physics.Freefall(frames=30), [0.01, 0.0, 0.06, 0.96, 0.2, 0.1, 0.17], 32),
     "falls off": (physics.Freefall(), [0.1, 0.01, 0.06, 0.5, 0.5, 0.5, 0.5], 32),
     "is jerked in the air": (physics.Perturbed(frames=30), [0.0, 0.0, 0.2, 0.9, 0.3, 0.1, 0.3], 0),
     "is jerked on the pad": (physics.Perturbed(frames=12), [0.01, 0.005, ON_PAD, 1.0, 0.0, 0.0, 0.0], 0),
     "is pushed and spins": (physics.Freefall(frames=14), [-0.02, 0.01, 0.06, 0.96, 0.2, 0.1, 0.17], 32),
-    "slides to the wall": (physics.Inclined(friction=(0.2, 0.2), frames=30), [0.01, 0.02, 0.05, 0.7, 0.1, 0.7, 0], 48),
+    "slides to the wall": (physics.Inclined(friction=(0.2, 0.2), frames=20), [0.01, 0.02, 0.05, 0.7, 0.1, 0.7, 0], 48),
 }
 PUSHED = np.array([0.2, -0.1, 0.05, 2.0, -3.0, 4.0])  # m/s, rad/s
 
@@ -95,13 +84,10 @@ PUSHED = np.array([0.2, -0.1, 0.05, 2.0, -3.0, 4.0])  # m/s, rad/s
 @pytest.mark.parametrize("name", CASES)
 def test_native_roll_equals_a_plain_loop_of_steps(name):
     scenario, pose, held = CASES[name]
-    body = BODIES[0]
-    pose = np.array([*pose[:3], *(np.array(pose[3:]) / np.linalg.norm(pose[3:]))])
+    body, pose = BODIES[0], np.array([*pose[:3], *(np.array(pose[3:]) / np.linalg.norm(pose[3:]))])
     condition = jnp.array([9.0, -3.0, 0.08])[: len(scenario.condition_scale)]
-    times = (
-        np.arange(scenario.frames)[:, None] / scenario.rate
-        - np.arange(scenario.steps, 0, -1) * scenario.contact.timestep
-    )
+    before = np.arange(scenario.steps, 0, -1) * scenario.contact.timestep
+    times = np.arange(scenario.frames)[:, None] / scenario.rate - before
     gravity = np.asarray(jax.vmap(jax.vmap(lambda t: scenario.gravity(t, condition)))(times), np.float64)
     hulls = np.asarray(body.hulls)
     model = native.compile_body(hulls, PAD, scenario.contact, scenario.wall)
@@ -113,7 +99,7 @@ def test_native_roll_equals_a_plain_loop_of_steps(name):
     ends, record = native.roll([model], points, start, gravity[None], velocity[None], freeze=False)
     # Force and gravity differ by rounding, which the contacts of a rocking base magnify to a millimetre. Whether the
     # force has the effect of gravity is tested below.
-    truth = plain_loop(model, points, pose, gravity, held, velocity, as_force=name == "is jerked on the pad")
+    truth = plain_loop(model, points, start, gravity, velocity, name == "is jerked on the pad")
     assert truth["gone"] == (name in ("falls off", "is jerked in the air"))
     assert truth["wall"].any() == (name == "slides to the wall")
     assert truth["contact"].any() == (name != "is jerked in the air")  # that object flies past the pad
@@ -131,7 +117,7 @@ def test_native_roll_equals_a_plain_loop_of_steps(name):
 def test_a_jerked_box_slides_by_coulombs_law(as_force):
     half, mass, friction = np.array([0.03, 0.03, 0.008]), 0.1, 0.5
     pull, lasts, frames, steps = 8.0, 0.08, 6, 160
-    points = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3) * half
+    points = box(*half)
     contact = physics.Perturbed().contact
     model = native.compile_body(np.float32(points)[None], PAD, contact)
     inertia = mass / 3 * np.diag(np.sum(half**2) - half**2)
@@ -140,38 +126,20 @@ def test_a_jerked_box_slides_by_coulombs_law(as_force):
     gravity[1, :, :2] = -pull * np.array([np.cos(0.4), np.sin(0.4)])
     assert steps * contact.timestep == pytest.approx(lasts)
     pose = np.array([0.02, 0.01, half[2] - STANDING, 1, 0, 0, 0])
+    start = Start(pose[None], np.array([0]), np.zeros((1, 0)))
     if as_force:
-        start = Start(pose[None], np.array([0]), np.zeros((1, 0)))
-        found = native.roll([model], points, start, gravity[None])[1].pose[0]
+        path = native.roll([model], points, start, gravity[None])[1].pose[0]
     else:
-        found = plain_loop(model, points, pose, gravity, 0, np.zeros(6), as_force=False)["pose"]
+        path = plain_loop(model, points, start, gravity, np.zeros(6), False)["pose"]
     speed = (pull - friction * G) * lasts
     distance = speed * lasts / 2 + speed**2 / (2 * friction * G)
-    np.testing.assert_allclose(np.linalg.norm(found[-1, :2] - found[0, :2]), distance, rtol=0.01)
+    np.testing.assert_allclose(np.linalg.norm(path[-1, :2] - path[0, :2]), distance, rtol=0.01)
 
 
-@pytest.fixture(scope="module")
-def drops():
-    return jax.tree.map(np.asarray, simulate(BODIES, scenario=physics.Freefall(), num=6))
+SLOW = [pytest.param(scenario, marks=pytest.mark.slow) for scenario in (physics.Inclined(), physics.Perturbed())]
 
 
-def test_results_are_independent_of_chunk_thread_and_other_bodies(drops, monkeypatch):
-    alone = simulate(BODIES[0], scenario=physics.Freefall(), num=3, chunk=1)
-    monkeypatch.setattr("os.cpu_count", lambda: 5)
-    other = simulate(BODIES[:2], scenario=physics.Freefall(), num=6, chunk=4)
-    for name in FIELDS:
-        np.testing.assert_array_equal(getattr(alone, name), getattr(drops, name)[:3])
-        np.testing.assert_array_equal(getattr(other, name), getattr(drops, name)[:12])
-
-
-@pytest.mark.parametrize(
-    "scenario",
-    [
-        physics.Freefall(),
-        physics.Released(),
-        *(pytest.param(scenario, marks=pytest.mark.slow) for scenario in (physics.Inclined(), physics.Perturbed())),
-    ],
-)
+@pytest.mark.parametrize("scenario", [physics.Freefall(), physics.Released(), *SLOW])
 def test_freezing_a_settled_object_keeps_its_end_and_its_wrench(scenario, monkeypatch):
     bodies = BODIES[:1] if scenario.must_stand else BODIES
     num = 18 // len(bodies)
@@ -183,7 +151,7 @@ def test_freezing_a_settled_object_keeps_its_end_and_its_wrench(scenario, monkey
     assert stopped.sum() >= 9
     for name in ("outcome", "settled", "touches", "condition"):
         np.testing.assert_array_equal(getattr(frozen, name), getattr(rolled, name))
-    for name in FIELDS:  # moving objects are unchanged
+    for name in ("pose", "velocity", "wrench", "contact", "wall", "sunk"):  # moving objects are unchanged
         np.testing.assert_array_equal(getattr(frozen, name)[~stopped], getattr(rolled, name)[~stopped])
     np.testing.assert_allclose(frozen.pose[stopped, -1, :3], rolled.pose[stopped, -1, :3], atol=1e-3)
     assert frozen.contact[stopped, -1].all()
@@ -191,6 +159,24 @@ def test_freezing_a_settled_object_keeps_its_end_and_its_wrench(scenario, monkey
     assert alone.sum() >= 5
     largest = np.abs(rolled.wrench[alone, -1, :3]).max()
     np.testing.assert_allclose(frozen.wrench[alone, -1, :3], rolled.wrench[alone, -1, :3], atol=0.02 * largest)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["Released", "Perturbed", "Inclined"])
+def test_both_engines_move_an_object_alike_from_the_start_of_a_scenario(name):
+    towards_wall = {"friction": (0.2, 0.2), "along": (0.05, 0.05), "resting": 1.0}
+    scenario = getattr(physics, name)(frames=4, **towards_wall if name == "Inclined" else {})
+    truth, ours = (
+        jax.tree.map(np.asarray, simulate(BODIES[0], scenario=scenario, num=4, chunk=4, engine=engine))
+        for engine in ("mujoco", "mjx")
+    )
+    weight = G * physics.rigids(BODIES, truth.body, truth.hidden).mass.min()
+    moved = np.abs(truth.pose[:, -1] - truth.pose[:, 0]).max()
+    assert moved > 0.002
+    assert np.abs(ours.pose - truth.pose).max() < (0.005 if name == "Released" else 0.05) * moved
+    np.testing.assert_allclose(ours.wrench[:, 0], truth.wrench[:, 0], atol=0.01 * weight)
+    np.testing.assert_array_equal(ours.contact[:, 0], truth.contact[:, 0])
+    assert ours.wall.any() == truth.wall.any() == (name == "Inclined")
 
 
 def test_a_weak_pull_does_not_end_a_trajectory_before_a_strong_one(monkeypatch):

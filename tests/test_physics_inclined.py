@@ -1,6 +1,5 @@
-"""`Inclined`: blocks hold or slide by Coulomb's law in every direction, and starts and outcomes."""
+"""`Inclined`: blocks hold or slide by Coulomb's law in every direction, and starts, walls and contents."""
 
-import copy
 import dataclasses
 
 import jax
@@ -8,46 +7,45 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-import scipy
+from physics_scenes import PAD, box, corners, hull, mjx_model, part, placed, rigid
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
 
-from sts_jax import geometry, objects, physics
-from sts_jax.physics import contact, roll, scene
+from sts_jax import objects, physics
+from sts_jax.physics import roll, scene
 from sts_jax.physics.scenario import STANDING, G
 from sts_jax.sensor import Sensor
 
-PAD = (0.15, 0.15)
 SLOPE = np.radians(30)
 AZIMUTHS = np.radians([0, 22.5, 45, 90, 200])
+DOWN = np.stack([np.cos(AZIMUTHS), np.sin(AZIMUTHS)], axis=-1)
 ROLL = jax.jit(jax.vmap(roll.roll, in_axes=(None, None, None, 0, 0)))
-
-
+INITIAL = jax.vmap(lambda pose: roll.initial(pose, jnp.zeros(6)))
 SCENARIO = physics.Inclined()
 STEPS = round(0.05 / SCENARIO.contact.timestep)  # a record every 50 ms
-CORNERS = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3) * [0.03, 0.02, 0.01]
-INERTIA = 0.1 * np.diag([1.7e-4, 3.3e-4, 4.3e-4])
+BLOCK = part(box(0.03, 0.02, 0.01))
+BODIES = [objects.make(jax.random.key(i), name) for i, name in enumerate(["bottle", "fork", "camera", "scissors"])]
 
 
-def slide(friction: float, constants: physics.Contact, frames: int, slope: float = SLOPE) -> roll.Record:
-    """A block of 60 x 40 x 20 mm on a pad that is tilted towards each azimuth, recorded every 50 ms."""
-    hull = jax.tree.map(jnp.asarray, contact.hull(np.concatenate([CORNERS, np.repeat(CORNERS[-1:], 24, axis=0)])[None]))
-    model, like, data = scene.template(PAD, constants)
-    model = copy.copy(model)
-    scene.set_rigid(model, mujoco.MjData(model), 0.1, np.zeros(3), INERTIA, friction)
-    own = like.tree_replace(scene.drawn(model, like))
-    down = np.stack([np.cos(AZIMUTHS), np.sin(AZIMUTHS)], axis=-1)
-    start = jax.vmap(lambda xy: roll.initial(jnp.array([*(-0.03 * xy), 0.01, 1, 0, 0, 0]), jnp.zeros(6)))(
-        jnp.asarray(down, jnp.float32)
-    )
-    tilted = G * np.concatenate([np.sin(slope) * down, np.full((len(down), 1), -np.cos(slope))], axis=1)
-    flat = np.tile([0, 0, -G], (len(down), 2, STEPS, 1))
-    gravity = np.concatenate([flat, np.tile(tilted[:, None, None], (1, frames, STEPS, 1))], axis=1)
-    return jax.tree.map(np.asarray, ROLL(own, data, hull, start, jnp.asarray(gravity, jnp.float32))[1])
+def block(friction: float, wall: float = 0.0) -> tuple:
+    """MJX's model and data of a block of 60 x 40 x 20 mm, and its hull."""
+    inertia = 0.1 * np.diag([1.7e-4, 3.3e-4, 4.3e-4])
+    return *mjx_model(SCENARIO.contact, 0.1, np.zeros(3), inertia, friction, wall), hull(BLOCK)
+
+
+def slide(friction: float, slope: float) -> roll.Record:
+    """The block on a pad that is tilted towards each azimuth, recorded every 50 ms."""
+    start = INITIAL(jnp.asarray(np.c_[-0.03 * DOWN, np.tile([0.01, 1, 0, 0, 0], (5, 1))], jnp.float32))
+    tilted = G * np.c_[np.sin(slope) * DOWN, np.full(5, -np.cos(slope))]
+    flat = np.tile([0, 0, -G], (5, 2, STEPS, 1))
+    gravity = np.concatenate([flat, np.tile(tilted[:, None, None], (1, 10, STEPS, 1))], axis=1)
+    return jax.tree.map(np.asarray, ROLL(*block(friction), start, jnp.asarray(gravity, jnp.float32))[1])
 
 
 @pytest.mark.slow
 def test_a_block_holds_below_the_friction_angle():
-    found = slide(float(np.tan(SLOPE) / 0.97), physics.Inclined().contact, 10)
-    creep = np.linalg.norm(found.pose[:, -1, :2] - found.pose[:, 6, :2], axis=1) / (5 * 0.05)
+    pose = slide(float(np.tan(SLOPE) / 0.97), SLOPE).pose
+    creep = np.linalg.norm(pose[:, -1, :2] - pose[:, 6, :2], axis=1) / (5 * 0.05)
     assert np.all(creep < 1e-3), creep
 
 
@@ -55,15 +53,14 @@ def test_a_block_holds_below_the_friction_angle():
 @pytest.mark.parametrize(("friction", "degrees"), [(0.2, 30), (0.4, 30), (0.2, 18), (0.4, 45)])
 def test_a_block_above_the_friction_angle_slides_by_coulombs_law(friction, degrees):
     slope = np.radians(degrees)
-    found = slide(friction, physics.Inclined().contact, 10, slope)
-    down = np.stack([np.cos(AZIMUTHS), np.sin(AZIMUTHS)], axis=-1)
-    speed = np.einsum("nfi,ni->nf", found.velocity[..., :2], down)
+    velocity = slide(friction, slope).velocity[..., :2]
+    speed = np.einsum("nfi,ni->nf", velocity, DOWN)
     gained = (speed[:, 4] - speed[:, 2]) / (2 * 0.05)
     expected = G * (np.sin(slope) - friction * np.cos(slope))
     # A block that rocks is pressed less for a moment. How much depends on rounding, and so on the processor.
     np.testing.assert_allclose(gained.mean(), expected, rtol=0.02)
     np.testing.assert_allclose(gained, expected, rtol=0.04)
-    across = np.abs(found.velocity[:, 4, 0] * down[:, 1] - found.velocity[:, 4, 1] * down[:, 0])
+    across = np.abs(velocity[:, 4, 0] * DOWN[:, 1] - velocity[:, 4, 1] * DOWN[:, 0])
     assert np.all(across < 0.01 * speed[:, 4])
 
 
@@ -83,40 +80,21 @@ def test_a_ball_rolls_with_five_sevenths_of_the_pull():
 
 
 @pytest.fixture(scope="module")
-def bodies():
-    return [objects.make(jax.random.key(i), name) for i, name in enumerate(["bottle", "fork", "camera", "scissors"])]
-
-
-@pytest.fixture(scope="module", params=[pytest.param("mjx", marks=pytest.mark.slow), "mujoco"])
-def slid(bodies, request):
+def slid():
     varied = dataclasses.replace(SCENARIO, friction=(0.35, 0.75), resting=0.8, tries=1)  # so that many objects slide
-    found = physics.simulate(jax.random.key(1), bodies, Sensor(), varied, 8, engine=request.param)
+    found = physics.simulate(jax.random.key(1), BODIES, Sensor(), varied, 8)
     return jax.tree.map(np.asarray, found)
 
 
-def points(bodies: list[objects.Body], slid: physics.Trajectory, row: int, frame: int) -> np.ndarray:
-    """Hull vertices in the sensor frame."""
-    pose = jnp.asarray(slid.pose[row, frame])
-    return np.asarray(geometry.transform(pose, bodies[slid.body[row]].hulls[0]))
-
-
-def weight(bodies: list[objects.Body], slid: physics.Trajectory, row: int) -> tuple[float, np.ndarray]:
-    """The weight (N), and the centre of mass in the mesh frame (m)."""
-    own = jax.tree.map(lambda x: jnp.asarray(x[row]), slid.hidden)
-    mass, com, _ = objects.rigid(bodies[slid.body[row]], own.fill, own.shell_scale, own.up)
-    return G * float(mass), np.asarray(com)
-
-
-@pytest.mark.slow
-def test_starts_are_on_a_face_or_just_above_the_pad_and_outside_the_wall(bodies, slid):
+def test_starts_are_on_a_face_or_just_above_the_pad_and_outside_the_wall(slid):
     resting = 0
     for row in range(len(slid.pose)):
-        corners = points(bodies, slid, row, 0)
-        lowest = corners[:, 2].min()
-        assert corners[:, 1].max() < PAD[1] / 2
+        points = corners(BODIES, slid, row)
+        lowest = points[:, 2].min()
+        assert points[:, 1].max() < PAD[1] / 2
         if slid.contact[row, 0]:
             resting += 1
-            face = corners[corners[:, 2] < lowest + 1e-3]
+            face = points[points[:, 2] < lowest + 1e-3]
             assert np.linalg.matrix_rank(face - face[0], tol=2e-3) >= 2  # on a face, not on a corner
             assert abs(lowest + STANDING) < 3e-4
             assert np.linalg.norm(slid.velocity[row, 0, :3]) < G / SCENARIO.rate
@@ -126,24 +104,42 @@ def test_starts_are_on_a_face_or_just_above_the_pad_and_outside_the_wall(bodies,
     assert 0.6 <= resting / len(slid.pose) <= 0.95
 
 
+def test_the_wrench_excludes_the_wall(slid):
+    on_pad = slid.settled & (slid.outcome != physics.Outcome.FELL_OFF)
+    leaning, alone = np.flatnonzero(on_pad & slid.wall[:, -1]), np.flatnonzero(on_pad & ~slid.wall[:, -1])
+    assert len(leaning) >= 5
+    assert len(alone) >= 3
+    for row in alone:  # the pad carries all of the weight, and its moment
+        mass, com, _ = rigid(BODIES, slid, row)
+        pull = mass * G * np.array([0, np.sin(SLOPE), -np.cos(SLOPE)])
+        moment = np.cross(placed(slid.pose[row, -1], com), pull)
+        np.testing.assert_allclose(slid.wrench[row, -1, :3], -pull, atol=0.02 * mass * G)
+        np.testing.assert_allclose(slid.wrench[row, -1, 3:], -moment, atol=0.02 * mass * G * 0.075)
+    for row in leaning:  # friction on the pad is at most that of Coulomb's law
+        force = slid.wrench[row, -1, :3]
+        assert np.linalg.norm(force[:2]) <= slid.hidden.friction[row] * force[2] * 1.02 + 1e-3
+    carried = np.array([-slid.wrench[r, -1, 1] / (rigid(BODIES, slid, r)[0] * G * np.sin(SLOPE)) for r in leaning])
+    assert np.mean(carried < 0.95) > 0.5  # the wall carries the rest
+
+
 @pytest.mark.slow
-def test_the_contents_decide_whether_an_object_at_rest_tips(bodies):
+def test_the_contents_decide_whether_an_object_at_rest_tips():
     keys = jax.random.split(jax.random.key(5), 300)
     rng = np.random.default_rng(0)
-    for body in bodies[0], bodies[2]:
-        corners, com = np.asarray(body.hulls, np.float64).reshape(-1, 3), np.asarray(body.shell_com, np.float64)
+    for body in BODIES[0], BODIES[2]:
+        points, com = np.asarray(body.hulls, np.float64).reshape(-1, 3), np.asarray(body.shell_com, np.float64)
         coms = com + 0.01 * rng.normal(size=(16, 3))
-        shape = physics.Shape(*map(jnp.asarray, (corners, *objects.rest_poses(corners, com), coms)))
+        shape = physics.Shape(*map(jnp.asarray, (points, *objects.rest_poses(points, com), coms)))
         undecided = []
         for tries in (1, 16):
             scenario = dataclasses.replace(SCENARIO, resting=1.0, tries=tries)
             start = jax.jit(jax.vmap(lambda key, s=scenario, x=shape: s.start(key, x, PAD).pose))
             rows = []
             for pose in np.asarray(start(keys), np.float64):
-                turn = scipy.spatial.transform.Rotation.from_quat(pose[3:], scalar_first=True)
-                laid, centres = turn.apply(corners), turn.apply(coms)
+                turn = Rotation.from_quat(pose[3:], scalar_first=True)
+                laid, centres = turn.apply(points), turn.apply(coms)
                 low = laid[:, 2].min()
-                face = scipy.spatial.ConvexHull(laid[laid[:, 2] < low + 1e-3, :2]).equations
+                face = ConvexHull(laid[laid[:, 2] < low + 1e-3, :2]).equations
                 meets = centres[:, :2] + (centres[:, 2:] - low) * np.array([0, np.tan(SLOPE)])
                 margin = -(meets @ face[:, :2].T + face[:, 2]).max(1)
                 rows.append(min(np.maximum(margin, 0).mean(), np.maximum(-margin, 0).mean()))
@@ -154,41 +150,18 @@ def test_the_contents_decide_whether_an_object_at_rest_tips(bodies):
 
 
 @pytest.mark.slow
-def test_the_wrench_excludes_the_wall(bodies, slid):
-    on_pad = slid.settled & (slid.outcome != physics.Outcome.FELL_OFF)
-    leaning, alone = np.flatnonzero(on_pad & slid.wall[:, -1]), np.flatnonzero(on_pad & ~slid.wall[:, -1])
-    assert len(leaning) >= 5
-    assert len(alone) >= 3
-    for row in alone:  # the pad carries all of the weight, and its moment
-        size, com = weight(bodies, slid, row)
-        pull = size * np.array([0, np.sin(SLOPE), -np.cos(SLOPE)])
-        centre = np.asarray(geometry.transform(jnp.asarray(slid.pose[row, -1]), jnp.asarray(com)))
-        np.testing.assert_allclose(slid.wrench[row, -1, :3], -pull, atol=0.02 * size)
-        np.testing.assert_allclose(slid.wrench[row, -1, 3:], -np.cross(centre, pull), atol=0.02 * size * 0.075)
-    for row in leaning:  # friction on the pad is at most that of Coulomb's law
-        force = slid.wrench[row, -1, :3]
-        assert np.linalg.norm(force[:2]) <= slid.hidden.friction[row] * force[2] * 1.02 + 1e-3
-    carried = np.array([-slid.wrench[row, -1, 1] / (weight(bodies, slid, row)[0] * np.sin(SLOPE)) for row in leaning])
-    assert np.mean(carried < 0.95) > 0.5  # the wall carries the rest
-
-
-@pytest.mark.slow
 def test_pad_and_wall_exert_the_whole_contact_force():
-    model, like, data = scene.template(PAD, SCENARIO.contact, 0.03)
-    model = copy.copy(model)
-    scene.set_rigid(model, mujoco.MjData(model), 0.1, np.zeros(3), INERTIA, 0.3)
-    own = like.tree_replace(jax.tree.map(jnp.asarray, scene.drawn(model, like)))
-    hull = contact.hull(np.concatenate([CORNERS, np.repeat(CORNERS[-1:], 24, axis=0)])[None])
+    model, data, points = block(0.3, 0.03)
     data = data.replace(qpos=jnp.array([0, 0.0552, 0.0098, 1, 0, 0, 0]))
-    contacts = jax.jit(roll._contacts)(own, jax.tree.map(jnp.asarray, hull), data.qpos)
-    new = jax.jit(lambda data: scene.step(own, data, contacts))(data)
+    contacts = jax.jit(roll._contacts)(model, points, data.qpos)
+    new = jax.jit(lambda data: scene.step(model, data, contacts))(data)
     frame = data.qpos.at[3:].set(jnp.array([1.0, 0, 0, 0]))  # the object does not turn against the world
-    pad, wall = physics.wrench(own, new, "pad", frame), physics.wrench(own, new, "wall", frame)
+    pad, wall = physics.wrench(model, new, "pad", frame), physics.wrench(model, new, "wall", frame)
     np.testing.assert_allclose(pad + wall, new.qfrc_constraint, rtol=1e-4, atol=1e-5)
     assert wall[1] < -0.1
     assert pad[2] > 0.1
 
-    in_c = scene.compile_scene(CORNERS[None], PAD, SCENARIO.contact, 0.03)
+    in_c = scene.compile_scene(BLOCK[:, :8], PAD, SCENARIO.contact, 0.03)
     state = mujoco.MjData(in_c)
     state.qpos[:] = data.qpos
     mujoco.mj_forward(in_c, state)
@@ -198,46 +171,24 @@ def test_pad_and_wall_exert_the_whole_contact_force():
         deepest = int(contacts.dist[ours].argmin()) + ours.start
         sign = np.where(state.contact.geom[theirs, :1] == in_c.geom(name).id, 1, -1)
         np.testing.assert_allclose(contacts.frame[deepest, 0], (sign * state.contact.frame[theirs, :3])[0], atol=1e-5)
-        there = np.asarray(contacts.dist[ours] < 0)
-        box = np.asarray(contacts.pos[ours])[there]
-        np.testing.assert_allclose(np.ptp(box, 0), np.ptp(state.contact.pos[theirs], 0), atol=5e-4)
+        touching = np.asarray(contacts.pos[ours])[np.asarray(contacts.dist[ours] < 0)]
+        np.testing.assert_allclose(np.ptp(touching, 0), np.ptp(state.contact.pos[theirs], 0), atol=5e-4)
 
 
 @pytest.mark.slow
 def test_objects_that_fall_beside_the_pad_gain_no_energy_at_the_wall():
-    model, like, data = scene.template(PAD, SCENARIO.contact, 0.02)
-    model = copy.copy(model)
-    scene.set_rigid(model, mujoco.MjData(model), 0.1, np.zeros(3), INERTIA, 0.3)
-    own = like.tree_replace(jax.tree.map(jnp.asarray, scene.drawn(model, like)))
-    hull = jax.tree.map(jnp.asarray, contact.hull(np.concatenate([CORNERS, np.repeat(CORNERS[-1:], 24, axis=0)])[None]))
-    across = np.linspace(0.08, 0.16, 48)  # over the pad's side, and past it
-    turn = np.random.default_rng(0).normal(size=(48, 4))
-    pose = np.concatenate([np.c_[across, np.full((48, 1), 0.03), np.full((48, 1), 0.03)], turn], axis=1)
-    pose[:, 3:] /= np.linalg.norm(turn, axis=1, keepdims=True)
-    start = jax.vmap(lambda pose: roll.initial(pose, jnp.zeros(6)))(jnp.asarray(pose, jnp.float32))
+    turn = np.random.default_rng(0).normal(size=(24, 4))
+    pose = np.tile([0.0, 0.03, 0.03, 1, 0, 0, 0], (24, 1))
+    pose[:, 0] = np.linspace(0.08, 0.16, 24)  # over the pad's side, and past it
+    pose[:, 3:] = turn / np.linalg.norm(turn, axis=1, keepdims=True)
     gravity = G * np.array([0, np.sin(SLOPE), -np.cos(SLOPE)])
-    steps = jnp.broadcast_to(jnp.asarray(gravity, jnp.float32), (48, 40, 20, 3))
-    _, record = jax.tree.map(np.asarray, ROLL(own, data, hull, start, steps))
+    steps = jnp.broadcast_to(jnp.asarray(gravity, jnp.float32), (24, 40, 20, 3))
+    _, record = jax.tree.map(np.asarray, ROLL(*block(0.3, 0.02), INITIAL(jnp.asarray(pose, jnp.float32)), steps))
     lost = (record.pose[..., :3] - pose[:, None, :3]) @ gravity
     assert record.wall.any(1).mean() > 0.5
     assert np.all(0.5 * np.sum(record.velocity[..., :3] ** 2, axis=-1) <= lost + 0.02)
 
 
-@pytest.mark.slow
-def test_outcomes_follow_from_the_poses():
-    first = jnp.array([0.01, -0.02, 0.05, 1, 0, 0, 0])
-    turn = jnp.array([jnp.cos(0.5), 0, 0, jnp.sin(0.5)])  # 57 degrees
-    cases = {
-        physics.Outcome.STICKS: first.at[1].set(-0.012),
-        physics.Outcome.SLIDES: first.at[1].set(-0.008),
-        physics.Outcome.ROLLS: first.at[3:].set(-turn),
-        physics.Outcome.FELL_OFF: first.at[3:].set(turn).at[2].set(-0.05),
-    }
-    for outcome, last in cases.items():
-        assert int(SCENARIO.outcome(first, last)) == outcome
-
-
-@pytest.mark.slow
 def test_contents_lie_in_all_directions_except_in_variants():
     keys = jax.random.split(jax.random.key(0), 2000)
     up = np.asarray(jax.vmap(SCENARIO.hidden)(keys).up)

@@ -5,20 +5,18 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from physics_scenes import PAD, placed
 from scipy.spatial.transform import Rotation
 
 import sts_jax as sts
 from sts_jax import objects, physics
 from sts_jax.physics import scene
 
-PAD = (0.15, 0.15)
 FRICTION = 0.6
 PLACES = {"yaw": 0.7, "position": (0.03, -0.02), "fill": 0.3}
 
 
-@pytest.fixture(scope="module")
-def bodies():
-    return [objects.make(jax.random.key(i), name) for i, name in enumerate(objects.CATEGORIES)]
+BODIES = {name: objects.make(jax.random.key(i), name) for i, name in enumerate(objects.CATEGORIES)}
 
 
 def simulated(body: objects.Body, pose: np.ndarray, fill: float, seconds: float) -> tuple[np.ndarray, np.ndarray]:
@@ -37,8 +35,8 @@ def simulated(body: objects.Body, pose: np.ndarray, fill: float, seconds: float)
 
 
 @pytest.mark.parametrize("category", objects.CATEGORIES)
-def test_c_mujoco_leaves_a_placed_body_there_and_carries_it_with_the_same_wrench(bodies, category):
-    body = bodies[objects.CATEGORIES.index(category)]
+def test_c_mujoco_leaves_a_placed_body_there_and_carries_it_with_the_same_wrench(category):
+    body = BODIES[category]
     for face in range(min(2, len(physics.stable_faces(body, fill=PLACES["fill"]).up))):
         placed = physics.place(body, sts.Sensor(), face=face, **PLACES)
         pose, wrench = (np.asarray(x, np.float64) for x in placed)
@@ -52,12 +50,12 @@ def test_c_mujoco_leaves_a_placed_body_there_and_carries_it_with_the_same_wrench
         np.testing.assert_allclose(mean[3:5], wrench[3:5], atol=1.5e-4 * force)
 
 
-def test_the_gel_balances_every_class_and_the_default_leds_neither_clip_nor_hide_it(bodies):
+def test_the_gel_balances_every_class_and_the_default_leds_neither_clip_nor_hide_it():
     sensor = sts.Sensor(lights=sts.tactile.Leds())
     away = jnp.array([0, 0, -1.0, 1, 0, 0, 0])
-    empty = np.asarray(sts.sense(sensor, bodies[0], away).tactile)
+    empty = np.asarray(sts.sense(sensor, BODIES["bottle"], away).tactile)
     assert np.mean((empty <= 0) | (empty >= 1), axis=(0, 1)).max() < 1e-3
-    for body in bodies:
+    for body in BODIES.values():
         frame = sts.sense(sensor, body, *physics.place(body, sensor, position=(0.01, 0.02)))
         assert bool(frame.balanced)
         image = np.asarray(frame.tactile)
@@ -65,14 +63,14 @@ def test_the_gel_balances_every_class_and_the_default_leds_neither_clip_nor_hide
         assert np.abs(image - empty).max() > 0.05
 
 
-def test_placement_has_the_requested_face_yaw_and_position(bodies):
-    body = bodies[0]
+def test_placement_has_the_requested_face_yaw_and_position():
+    body = BODIES["bottle"]
     standing = physics.place(body, sts.Sensor(), face="upright", position=(0.01, -0.02), yaw=np.pi / 2)
-    w, x, y, z = np.asarray(standing.pose[3:], np.float64)
-    turn = Rotation.from_quat([x, y, z, w]).as_matrix()
+    pose = np.asarray(standing.pose, np.float64)
+    turn = Rotation.from_quat(pose[3:], scalar_first=True).as_matrix()
     np.testing.assert_allclose(turn[:, 2], [0, 0, 1], atol=1e-5)
     np.testing.assert_allclose(turn[:, 1], [-1, 0, 0], atol=1e-5)  # its -y, at the top of the image, turned by +90
-    points = np.asarray(body.hulls, float).reshape(-1, 3) @ turn.T + np.asarray(standing.pose[:3])
+    points = placed(pose, np.asarray(body.hulls, float).reshape(-1, 3))
     np.testing.assert_allclose((points.min(0) + points.max(0))[:2] / 2, [0.01, -0.02], atol=1e-6)
     np.testing.assert_allclose(points.min(0)[2], -1e-5, atol=1e-6)
     faces = physics.stable_faces(body)

@@ -1,7 +1,7 @@
-"""`simulate` and `Freefall`, compared with C MuJoCo and closed forms."""
+"""`simulate` and `Freefall`, compared with C MuJoCo and closed forms, and the outcomes of all scenarios."""
 
-import copy
 import dataclasses
+import functools
 import re
 
 import jax
@@ -9,21 +9,19 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from physics_scenes import PAD, box, corners, hull, mjx_model, part, placed, rigid
+from scipy.spatial.transform import Rotation
 
 from sts_jax import objects, physics
-from sts_jax.physics import contact, engines, roll, scene, simulation
+from sts_jax.physics import Freefall, Inclined, Outcome, Perturbed, Released, engines, roll, scene, simulation
 from sts_jax.physics.scenario import G
 from sts_jax.sensor import Sensor
 
 NUM = 6
-PAD = (0.15, 0.15)
-SCENARIO = physics.Freefall()
+SCENARIO = Freefall()
+BODIES = [objects.make(jax.random.key(i), name) for i, name in enumerate(["bottle", "fork", "webcam", "watch"])]
 ROLL = jax.jit(roll.roll)  # compiled once, for (3, 100) steps
-
-
-@pytest.fixture(scope="module")
-def bodies():
-    return [objects.make(jax.random.key(i), name) for i, name in enumerate(["bottle", "fork", "webcam", "watch"])]
+simulate = functools.partial(physics.simulate, sensor=Sensor(), scenario=SCENARIO, chunk=24)
 
 
 @pytest.fixture(scope="module", params=[pytest.param("mjx", marks=pytest.mark.slow), "mujoco"])
@@ -31,26 +29,17 @@ def engine(request):
     return request.param
 
 
-@pytest.fixture(scope="module")
-def drops(bodies, engine):
-    found = physics.simulate(jax.random.key(3), bodies, Sensor(), SCENARIO, NUM, chunk=24, engine=engine)
-    return jax.tree.map(np.asarray, found)
+@functools.cache
+def dropped(engine: physics.Engine) -> physics.Trajectory:
+    return jax.tree.map(np.asarray, simulate(jax.random.key(3), BODIES, num=NUM, engine=engine))
 
 
-def rigid(bodies: list[objects.Body], drops: physics.Trajectory, row: int) -> tuple[float, np.ndarray, np.ndarray]:
-    own = jax.tree.map(lambda x: jnp.asarray(x[row]), drops.hidden)
-    mass, com, inertia = objects.rigid(bodies[drops.body[row]], own.fill, own.shell_scale, own.up)
-    return float(mass), np.asarray(com, np.float64), np.asarray(inertia, np.float64)
+@pytest.fixture
+def drops(engine):
+    return dropped(engine)
 
 
-def c_model(bodies: list[objects.Body], drops: physics.Trajectory, row: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    model = scene.compile_scene(np.asarray(bodies[drops.body[row]].hulls), PAD, SCENARIO.contact)
-    data = mujoco.MjData(model)
-    scene.set_rigid(model, data, *rigid(bodies, drops, row), float(drops.hidden.friction[row]))
-    return model, data
-
-
-def test_shapes_and_order(drops):
+def test_fields_have_their_order_shapes_and_ranges(drops):
     count, frames = 4 * NUM, SCENARIO.frames
     for name, width in {"pose": 7, "velocity": 6, "wrench": 6, "gravity": 3}.items():
         assert getattr(drops, name).shape == (count, frames, width)
@@ -61,26 +50,6 @@ def test_shapes_and_order(drops):
     np.testing.assert_array_equal(drops.gravity, np.broadcast_to(np.float32([0, 0, -G]), drops.gravity.shape))
     np.testing.assert_allclose(np.linalg.norm(drops.pose[..., 3:], axis=-1), 1, atol=1e-6)
     assert np.all(drops.pose[..., 3] >= 0)
-
-
-def test_frame_0_is_at_rest_in_the_air_at_the_stated_height(bodies, drops):
-    for row in range(4 * NUM):
-        matrix = np.empty(9)
-        mujoco.mju_quat2Mat(matrix, drops.pose[row, 0, 3:].astype(np.float64))
-        lowest = np.min(np.asarray(bodies[drops.body[row]].hulls[0]) @ matrix.reshape(3, 3)[2]) + drops.pose[row, 0, 2]
-        np.testing.assert_allclose(lowest, SCENARIO.height, atol=2e-6)
-    np.testing.assert_allclose(drops.velocity[:, 0], 0, atol=1e-5)
-    assert not drops.contact[:, 0].any()
-    assert not drops.wrench[:, 0].any()
-    assert np.all(np.linalg.norm(drops.pose[:, 0, :2], axis=1) <= SCENARIO.spread + 1e-6)
-
-
-def test_free_flight_is_the_parabola(drops):
-    fall = 0.5 * G * drops.time[0, :3] * (drops.time[0, :3] + SCENARIO.contact.timestep)
-    np.testing.assert_allclose(drops.pose[:, :3, 2] - drops.pose[:, :1, 2], np.tile(-fall, (4 * NUM, 1)), atol=5e-6)
-
-
-def test_hidden_values_and_outcomes_are_in_range(drops):
     for name in ("fill", "shell_scale", "friction"):
         low, high = getattr(SCENARIO, name)
         assert np.all((getattr(drops.hidden, name) >= low) & (getattr(drops.hidden, name) <= high))
@@ -91,31 +60,39 @@ def test_hidden_values_and_outcomes_are_in_range(drops):
     assert not drops.resampled.any()
 
 
-def test_the_wrench_at_rest_carries_the_weight(bodies, drops):
-    rows = np.flatnonzero(drops.settled & (drops.outcome == physics.Outcome.RESTS))
+def test_drops_begin_at_rest_at_the_stated_height_and_follow_the_parabola(drops):
+    lowest = [corners(BODIES, drops, row)[:, 2].min() for row in range(4 * NUM)]
+    np.testing.assert_allclose(lowest, SCENARIO.height, atol=2e-6)
+    np.testing.assert_allclose(drops.velocity[:, 0], 0, atol=1e-5)
+    assert not drops.contact[:, 0].any()
+    assert not drops.wrench[:, 0].any()
+    assert np.all(np.linalg.norm(drops.pose[:, 0, :2], axis=1) <= SCENARIO.spread + 1e-6)
+    fall = 0.5 * G * drops.time[0, :3] * (drops.time[0, :3] + SCENARIO.contact.timestep)
+    np.testing.assert_allclose(drops.pose[:, :3, 2] - drops.pose[:, :1, 2], np.tile(-fall, (4 * NUM, 1)), atol=5e-6)
+
+
+def test_the_wrench_at_rest_carries_the_weight(drops):
+    rows = np.flatnonzero(drops.settled & (drops.outcome == Outcome.RESTS))
     assert len(rows) >= 12
     for row in rows:
-        mass, com, _ = rigid(bodies, drops, row)
-        matrix = np.empty(9)
-        mujoco.mju_quat2Mat(matrix, drops.pose[row, -1, 3:].astype(np.float64))
-        centre = drops.pose[row, -1, :3] + matrix.reshape(3, 3) @ com
-        wrench = drops.wrench[row, -1]
-        np.testing.assert_allclose(wrench[2], mass * G, rtol=0.02)
+        mass, com, _ = rigid(BODIES, drops, row)
+        x, y, _ = placed(drops.pose[row, -1], com)
+        wrench = drops.wrench[row, -1] / (mass * G)
+        np.testing.assert_allclose(wrench[2], 1, rtol=0.02)
         # Moments of the weight about the sensor's origin, to 2 % of it times half the pad.
-        np.testing.assert_allclose(
-            wrench[3:5], mass * G * np.array([centre[1], -centre[0]]), atol=0.02 * mass * G * 0.075
-        )
+        np.testing.assert_allclose(wrench[3:5], [y, -x], atol=0.02 * 0.075)
 
 
-def test_states_equal_those_of_c_mujoco_until_shortly_after_the_first_touch(bodies, drops, engine):
-    steps = round(1 / SCENARIO.rate / SCENARIO.contact.timestep)
+def test_states_equal_those_of_c_mujoco_until_shortly_after_the_first_touch(drops, engine):
     before, after = [], []
     for row in range(4 * NUM):
-        model, data = c_model(bodies, drops, row)
+        model = scene.compile_scene(np.asarray(BODIES[drops.body[row]].hulls), PAD, SCENARIO.contact)
+        data = mujoco.MjData(model)
+        scene.set_rigid(model, data, *rigid(BODIES, drops, row), float(drops.hidden.friction[row]))
         data.qpos[:] = drops.pose[row, 0]
         for frame in range(1, SCENARIO.frames):
             touched = False
-            for _ in range(steps):
+            for _ in range(SCENARIO.steps):
                 mujoco.mj_step(model, data)
                 touched |= data.ncon > 0
             (after if touched else before).append(np.linalg.norm(data.qpos[:3] - drops.pose[row, frame, :3]))
@@ -131,14 +108,9 @@ def test_states_equal_those_of_c_mujoco_until_shortly_after_the_first_touch(bodi
 
 @pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
 def test_a_drawn_model_equals_a_freshly_compiled_one(scale):
-    constants = physics.Contact()
-    model, like, _ = scene.template(PAD, constants)
-    model = copy.copy(model)
-    mass, com = 0.2 * scale, np.array([0.003, -0.002, 0.01])
+    constants, mass, com = physics.Contact(), 0.2 * scale, np.array([0.003, -0.002, 0.01])
     inertia = scale * (np.diag([2e-4, 3e-4, 1e-4]) + 2e-5)
-    scene.set_rigid(model, mujoco.MjData(model), mass, com, inertia, 0.7)
-    drawn = like.tree_replace(scene.drawn(model, like))
-
+    drawn, _ = mjx_model(constants, mass, com, inertia, 0.7)
     spec = mujoco.MjSpec.from_string(scene._xml(PAD, 0.0, constants, ['type="box" size=".01 .01 .01"'] * 2, "", ""))
     body = spec.body("object")
     body.mass, body.ipos = mass, com
@@ -154,112 +126,83 @@ def test_a_drawn_model_equals_a_freshly_compiled_one(scale):
     np.testing.assert_allclose(np.sort(drawn.body_inertia[1]), np.sort(fresh.body_inertia[1]), rtol=1e-5)
 
 
-def block(mass: float) -> tuple[scene.mjx.Model, scene.mjx.Data, contact.Hull]:
-    grid = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3) * [0.03, 0.02, 0.01]
-    hull = jax.tree.map(jnp.asarray, contact.hull(np.concatenate([grid, np.repeat(grid[-1:], 24, axis=0)])[None]))
-    model, like, data = scene.template(PAD, physics.Contact())
-    model = copy.copy(model)
-    scene.set_rigid(model, mujoco.MjData(model), mass, np.zeros(3), mass * np.diag([1e-4, 2e-4, 3e-4]), 0.5)
-    return like.tree_replace(jax.tree.map(jnp.asarray, scene.drawn(model, like))), data, hull
-
-
-def released(height: float) -> roll.State:
-    return roll.initial(jnp.array([0, 0, height, 1, 0, 0, 0]), jnp.zeros(6))
-
-
 CALM = jnp.tile(jnp.array([0, 0, -G]), (3, 100, 1))
+
+
+def rolled(mass: float, height: float, gravity: jax.Array) -> tuple[roll.State, roll.Record]:
+    """A block of 60 x 40 x 20 mm, released at a height (m) of its centre."""
+    model = mjx_model(physics.Contact(), mass, np.zeros(3), mass * np.diag([1e-4, 2e-4, 3e-4]), 0.5)
+    start = roll.initial(jnp.array([0, 0, height, 1, 0, 0, 0]), jnp.zeros(6))
+    return ROLL(*model, hull(part(box(0.03, 0.02, 0.01))), start, gravity)
 
 
 @pytest.mark.slow
 def test_contact_stiffness_does_not_depend_on_mass():
-    light, heavy = (0.01 - float(ROLL(*block(mass), released(0.01), CALM)[0].qpos[2]) for mass in (0.01, 1.0))
+    light, heavy = (0.01 - float(rolled(mass, 0.01, CALM)[0].qpos[2]) for mass in (0.01, 1.0))
     assert 0 < light < 1e-4
     np.testing.assert_allclose(light, heavy, rtol=0.05)
 
 
-def test_later_gravity_leaves_frame_0_bit_identical():
-    shaken = CALM.at[1:, :, 0].set(5.0)
-    (_, a), (_, b) = (ROLL(*block(0.1), released(0.01), gravity) for gravity in (CALM, shaken))
+def test_gravity_may_change_with_time_and_leaves_earlier_frames_bit_identical():
+    (_, a), (_, b) = (rolled(0.1, 0.01, gravity) for gravity in (CALM, CALM.at[1:, :, 0].set(5.0)))
     assert bool(a.contact[0])
     jax.tree.map(lambda x, y: np.testing.assert_array_equal(x[0], y[0]), a, b)
     assert not np.array_equal(a.pose[2], b.pose[2])
-
-
-def test_gravity_may_change_with_time():
-    gravity = jnp.zeros((3, 100, 3)).at[0, :10, 1].set(3.0)
-    _, record = ROLL(*block(0.1), released(1.0), gravity)
+    _, pushed = rolled(0.1, 1.0, jnp.zeros((3, 100, 3)).at[0, :10, 1].set(3.0))
     speed = 3.0 * 10 * physics.Contact().timestep
-    np.testing.assert_allclose(record.velocity[:, :3], [[0, speed, 0]] * 3, atol=1e-6)
+    np.testing.assert_allclose(pushed.velocity[:, :3], [[0, speed, 0]] * 3, atol=1e-6)
 
 
-def test_trajectories_are_reproducible_whatever_their_number_and_the_progress_bar(bodies, drops, engine, capsys):
-    again = physics.simulate(
-        jax.random.key(3), bodies[:1], Sensor(), SCENARIO, 3, chunk=24, progress=True, engine=engine
-    )
+def test_trajectories_do_not_depend_on_number_chunk_threads_and_progress_bar(drops, engine, capsys, monkeypatch):
+    monkeypatch.setattr("os.cpu_count", lambda: 5)
+    chunk, text = {"mjx": (24, "simulate: compiling"), "mujoco": (1, "simulate")}[engine]
+    again = simulate(jax.random.key(3), BODIES[:2], num=3, chunk=chunk, progress=True, engine=engine)
     out, err = capsys.readouterr()
     assert out == ""
-    first = "simulate: compiling" if engine == "mjx" else "simulate"
-    assert re.search(rf"{first}: +0%.* 0/3 .*simulate: 100%.* 3/3 ", err, re.DOTALL)
-    for name in ("pose", "velocity", "wrench", "settled", "touches"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(drops, name)[:3])
+    assert re.search(rf"{text}: +0%.* 0/6 .*simulate: 100%.* 6/6 ", err, re.DOTALL)
+    for name in ("pose", "velocity", "wrench", "contact", "settled", "touches", "sunk"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(drops, name)[[0, 1, 2, 6, 7, 8]])
 
 
-def test_given_hidden_values_keep_the_starts_and_nothing_is_printed_by_default(bodies, drops, engine, capsys):
-    hidden = jax.tree.map(lambda x: x[:NUM], drops.hidden)
+def test_given_starts_and_hidden_values_replace_the_draws_and_nothing_is_printed_by_default(capsys):
+    drops = dropped("mujoco")
+    hidden, pose = jax.tree.map(lambda x: x[:NUM], drops.hidden), drops.pose[:NUM]
     heavy = hidden._replace(fill=np.append(hidden.fill[:1], np.ones(NUM - 1, np.float32)))
-    other = physics.simulate(
-        jax.random.key(3), bodies[0], Sensor(), SCENARIO, NUM, hidden=heavy, chunk=24, engine=engine
-    )
+    other = simulate(jax.random.key(3), BODIES[0], num=NUM, hidden=heavy)
     assert capsys.readouterr() == ("", "")
-    np.testing.assert_array_equal(other.pose[:, 0], drops.pose[:NUM, 0])
-    np.testing.assert_array_equal(other.pose[0], drops.pose[0])
-    assert not np.any(np.all(other.pose[1:, -1] == drops.pose[1:NUM, -1], axis=1))
+    np.testing.assert_array_equal(other.pose[:, 0], pose[:, 0])
+    np.testing.assert_array_equal(other.pose[0], pose[0])
+    assert not np.any(np.all(other.pose[1:, -1] == pose[1:, -1], axis=1))
+
+    start = physics.Start(pose[:, 0], jnp.asarray(SCENARIO.steps), drops.condition[:NUM])
+    again = simulate(jax.random.key(9), BODIES[0], num=NUM, start=start, hidden=hidden)
+    np.testing.assert_allclose(again.pose, pose, atol=1e-6)
+    other = simulate(jax.random.key(9), BODIES[0], num=NUM, start=start)
+    np.testing.assert_allclose(other.pose[:, 0], pose[:, 0], atol=1e-6)
+    assert not np.any(np.all(other.pose[:, -1] == pose[:, -1], axis=1))
 
 
-def test_given_starts_and_hidden_values_repeat_trajectories_of_another_key(bodies, drops, engine):
-    start = physics.Start(drops.pose[:NUM, 0], jnp.asarray(SCENARIO.steps), drops.condition[:NUM])
-    hidden = jax.tree.map(lambda x: x[:NUM], drops.hidden)
-    again = physics.simulate(
-        jax.random.key(9), bodies[0], Sensor(), SCENARIO, NUM, start=start, hidden=hidden, chunk=24, engine=engine
-    )
-    np.testing.assert_allclose(again.pose, drops.pose[:NUM], atol=1e-6)  # MJX normalises the given quaternion again
-    other = physics.simulate(
-        jax.random.key(9), bodies[0], Sensor(), SCENARIO, NUM, start=start, chunk=24, engine=engine
-    )
-    np.testing.assert_allclose(other.pose[:, 0], drops.pose[:NUM, 0], atol=1e-6)
-    assert not np.any(np.all(other.pose[:, -1] == drops.pose[:NUM, -1], axis=1))
-
-
-def test_objects_that_leave_the_pad_are_frozen(bodies, engine):
-    scenario = dataclasses.replace(SCENARIO, spread=0.15)
-    drops = physics.simulate(jax.random.key(0), bodies[2], Sensor(), scenario, 24, chunk=24, engine=engine)
-    fell = np.asarray(drops.outcome) == physics.Outcome.FELL_OFF
-    assert 0.1 < fell.mean() < 1
-    gone = fell & np.asarray(drops.settled)
-    np.testing.assert_array_equal(drops.velocity[gone, -1], 0)
-    np.testing.assert_array_equal(drops.wrench[gone, -1], 0)
-    np.testing.assert_array_equal(drops.pose[gone, -1], drops.pose[gone, -2])
-    assert np.all(drops.pose[gone, -1, 2] < -0.01)
-
-
-@pytest.mark.slow
-def test_objects_compile_once(bodies):
-    physics.simulate(jax.random.key(3), bodies[0], Sensor(), SCENARIO, 1, chunk=24, engine="mjx")
+def test_objects_that_leave_the_pad_are_frozen_and_no_object_compiles_anew(drops, engine):
     before = engines.roll_worlds._cache_size()
-    more = [objects.make(jax.random.key(20), "spoon"), objects.make(jax.random.key(21), "mouse")]
-    physics.simulate(jax.random.key(0), more, Sensor(), SCENARIO, 1, chunk=24, engine="mjx")
+    bodies = [BODIES[2], *(objects.make(jax.random.key(20), name) for name in ("spoon", "mouse"))]
+    scenario = dataclasses.replace(SCENARIO, spread=0.15)
+    found = simulate(jax.random.key(0), bodies, scenario=scenario, num=8, engine=engine)
     assert engines.roll_worlds._cache_size() == before
+    fell = np.asarray(found.outcome) == Outcome.FELL_OFF
+    assert 0.1 < fell.mean() < 1
+    gone = fell & np.asarray(found.settled)
+    np.testing.assert_array_equal(found.velocity[gone, -1], 0)
+    np.testing.assert_array_equal(found.wrench[gone, -1], 0)
+    np.testing.assert_array_equal(found.pose[gone, -1], found.pose[gone, -2])
+    assert np.all(found.pose[gone, -1, 2] < -0.01)
 
 
-@pytest.mark.slow
-def test_progress_and_resampling(bodies, drops, engine, monkeypatch):
+def test_a_trajectory_that_sinks_too_deep_is_drawn_again(monkeypatch):
+    drops, done = dropped("mujoco"), []
     sunk = drops.sunk[:NUM]
-    limit = float(np.sort(sunk)[-2] + np.sort(sunk)[-1]) / 2
+    limit = float(np.sort(sunk)[-2:].mean())
     monkeypatch.setattr(simulation, "SUNK_LIMIT", limit)
-    done: list[int] = []
-    again = physics.simulate(
-        jax.random.key(3), bodies[0], Sensor(), SCENARIO, NUM, chunk=24, progress=done.append, engine=engine
-    )
+    again = simulate(jax.random.key(3), BODIES[0], num=NUM, progress=done.append)
     worst = int(np.argmax(sunk))
     assert again.resampled[worst] >= 1
     assert np.all(again.sunk <= limit)
@@ -268,20 +211,42 @@ def test_progress_and_resampling(bodies, drops, engine, monkeypatch):
     monkeypatch.setattr(simulation, "SUNK_LIMIT", 0.0)
     monkeypatch.setattr(simulation, "ATTEMPTS", 1)
     with pytest.raises(ValueError, match=r"body 0: trajectory 0 of this body failed in each of 1 attempts"):
-        physics.simulate(jax.random.key(3), bodies[0], Sensor(), SCENARIO, 1, chunk=24, engine=engine)
+        simulate(jax.random.key(3), BODIES[0], num=1)
 
 
-def test_the_outcome_of_a_fall_follows_from_the_last_pose():
-    first = jnp.array([0, 0, 0.1, 1, 0, 0, 0])
-    assert int(SCENARIO.outcome(first, first.at[2].set(0.001))) == physics.Outcome.RESTS
-    assert int(SCENARIO.outcome(first, first.at[2].set(-0.02))) == physics.Outcome.FELL_OFF
+@pytest.mark.parametrize(
+    ("scenario", "shift", "turn", "outcome"),
+    [
+        (Freefall(), (0, 0, -0.049), (0, 0), Outcome.RESTS),
+        (Freefall(), (0, 0, -0.07), (0, 0), Outcome.FELL_OFF),
+        (Inclined(), (0, 0.008, 0), (0, 0), Outcome.STICKS),
+        (Inclined(), (0, 0.012, 0), (0, 0), Outcome.SLIDES),
+        (Inclined(), (0, 0, 0), (0, 1), Outcome.ROLLS),
+        (Inclined(), (0, 0, -0.1), (0, 1), Outcome.FELL_OFF),
+        (Perturbed(), (0, 0.009, 0), (0, 0), Outcome.STANDS),
+        (Perturbed(), (0, 0.011, 0), (0, 0), Outcome.SLIDES),
+        (Perturbed(), (0, 0, 0), (1, 0), Outcome.TOPPLES),
+        (Perturbed(), (0, 0, -0.1), (1, 0), Outcome.FELL_OFF),
+        (Released(), (0.02, 0.03, 0), (0, 0), Outcome.RETURNS),
+        (Released(), (0.02, 0.03, 0), (0, 2), Outcome.RETURNS),
+        (Released(), (0.02, 0.03, 0), (np.pi / 2, 2), Outcome.TOPPLES),
+        (Released(), (0.02, 0.03, -0.1), (np.pi / 2, 0), Outcome.FELL_OFF),
+    ],
+)
+def test_outcomes_follow_from_the_first_and_the_last_pose(scenario, shift, turn, outcome):
+    """`turn`: angles of the last orientation about x and then z (rad). A hand holds an object at 0.4 rad."""
+    leaning = Rotation.from_euler("x", 0.4 if isinstance(scenario, Released) else 0.0)
+    first = np.array([0.01, -0.02, 0.05, *leaning.as_quat(scalar_first=True)])
+    last = np.array([*first[:3] + shift, *-Rotation.from_euler("xz", turn).as_quat(scalar_first=True)])
+    assert int(scenario.outcome(jnp.asarray(first), jnp.asarray(last))) == outcome
 
 
-def test_outcomes_print_as_words_and_a_trajectory_prints_as_a_summary(drops):
+def test_outcomes_print_as_words_and_a_trajectory_prints_as_a_summary():
+    drops = dropped("mujoco")
     assert len(drops.outcomes) == 4 * NUM
-    assert all(isinstance(outcome, physics.Outcome) for outcome in drops.outcomes)
+    assert all(isinstance(outcome, Outcome) for outcome in drops.outcomes)
     np.testing.assert_array_equal(drops.outcomes, drops.outcome)
-    assert f"{physics.Outcome.FELL_OFF}" == str(physics.Outcome.FELL_OFF) == "fell off"
+    assert f"{Outcome.FELL_OFF}" == str(Outcome.FELL_OFF) == "fell off"
     ended = drops._replace(outcome=np.repeat(np.int32([0, 1]), [22, 2]), settled=np.arange(24) > 0)
     text = "24 trajectories of 4 bodies, 60 frames in 1.89 s; 22 rests, 2 fell off; 1 not settled at the end"
     assert repr(ended) == f"Trajectory({text})"
@@ -289,28 +254,27 @@ def test_outcomes_print_as_words_and_a_trajectory_prints_as_a_summary(drops):
     assert "pose=(24, 60, 7)" in repr(jax.eval_shape(lambda x: x, drops))
 
 
-def test_further_starts_are_independent_of_simulated_ones_and_of_their_number(bodies):
-    key, two = jax.random.key(3), bodies[:2]
-    one = physics.starts(key, two, Sensor(), SCENARIO, 3)
-    assert one.pose.shape == (6, 7)
-    np.testing.assert_array_equal(one.body, [0, 0, 0, 1, 1, 1])
-    assert len(np.unique(np.round(one.hidden.fill, 6))) == 6
-    fewer = physics.starts(key, bodies[0], Sensor(), SCENARIO, 2)
+def test_further_starts_are_independent_of_simulated_ones_and_of_their_number():
+    key = jax.random.key(3)
+    one = physics.starts(key, BODIES[:2], Sensor(), SCENARIO, NUM)
+    assert one.pose.shape == (2 * NUM, 7)
+    np.testing.assert_array_equal(one.body, np.repeat([0, 1], NUM))
+    assert len(np.unique(np.round(one.hidden.fill, 6))) == 2 * NUM
+    fewer = physics.starts(key, BODIES[0], Sensor(), SCENARIO, 2)
     np.testing.assert_allclose(fewer.pose, one.pose[:2], atol=1e-6)
     np.testing.assert_array_equal(fewer.hidden.fill, one.hidden.fill[:2])
-    drawn = physics.simulate(key, two, Sensor(), SCENARIO, 3, engine="mujoco")
-    for further, own in ((one.pose, drawn.pose[:, 0]), (one.hidden.fill, drawn.hidden.fill)):
-        assert np.abs(np.asarray(further)[:, None] - np.asarray(own)[None]).reshape(36, -1).max(1).min() > 1e-4
+    drawn = jax.tree.map(lambda x: x[: 2 * NUM], dropped("mujoco"))
+    for further, other in ((one.pose, drawn.pose[:, 0]), (one.hidden.fill, drawn.hidden.fill)):
+        difference = np.abs(np.asarray(further)[:, None] - other[None])
+        assert difference.reshape((2 * NUM) ** 2, -1).max(1).min() > 1e-4
 
 
-def test_mass_properties_of_draws_equal_those_of_single_bodies(bodies):
-    drawn = physics.starts(jax.random.key(5), bodies[:2], Sensor(), SCENARIO, 9).hidden
-    which = np.repeat([0, 1], 9)
-    found = physics.rigids(bodies[:2], which, drawn)
+def test_mass_properties_of_draws_equal_those_of_single_bodies():
+    drawn = physics.starts(jax.random.key(5), BODIES[:2], Sensor(), SCENARIO, 9)
+    found = physics.rigids(BODIES[:2], np.repeat([0, 1], 9), drawn.hidden)
     for row in (0, 8, 9, 17):
-        own = jax.tree.map(lambda x, row=row: x[row], drawn)
-        mass, com, inertia = objects.rigid(bodies[which[row]], own.fill, own.shell_scale, own.up)
+        mass, com, inertia = rigid(BODIES, drawn, row)
         np.testing.assert_allclose(found.mass[row], mass, rtol=1e-5)
         np.testing.assert_allclose(found.com[row], com, atol=1e-7)
         np.testing.assert_allclose(found.inertia[row], inertia, rtol=1e-3, atol=1e-9)
-        assert found.friction[row] == own.friction
+        assert found.friction[row] == drawn.hidden.friction[row]

@@ -49,14 +49,14 @@ def moving(cone: str, condim: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
 
 
 @pytest.mark.parametrize(("cone", "condim"), KINDS)
-def test_all_contacts_of_a_free_body_are_its_constraint_force(cone, condim):
+def test_all_contacts_of_a_free_body_are_its_constraint_force_in_both_engines(cone, condim):
     model, data = moving(cone, condim)
-    inputs = mjx.put_model(model), mjx.put_data(model, data)
-    in_mjx = jax.jit(mjx.forward)(*inputs)
+    mjx_model = mjx.put_model(model)
+    in_mjx = jax.jit(mjx.forward)(mjx_model, mjx.put_data(model, data))
     for own, others, at in (("box", ["plane", "ball"], 0), ("ball", ["plane", 1], 6)):
         pose = data.qpos[at // 6 * 7 :][:7]
         turn = Rotation.from_quat(pose[3:], scalar_first=True)
-        for d, m, tolerance in ((data, model, 1e-10), (in_mjx, inputs[0], 1e-5)):
+        for d, m, tolerance in ((data, model, 1e-10), (in_mjx, mjx_model, 1e-5)):
             force = np.asarray(d.qfrc_constraint)[at : at + 6]
             expected = np.concatenate([force[:3], turn.apply(force[3:])])  # the free joint's moments are in its frame
             size = np.abs(expected).max()
@@ -64,17 +64,9 @@ def test_all_contacts_of_a_free_body_are_its_constraint_force(cone, condim):
             frame = np.array([*pose[:3], 1, 0, 0, 0])
             np.testing.assert_allclose(physics.wrench(m, d, others, frame), expected, atol=tolerance * size)
             np.testing.assert_allclose(physics.wrench(m, d, own, frame), -expected, atol=tolerance * size)
-
-
-@pytest.mark.parametrize(("cone", "condim"), KINDS)
-def test_mjx_gives_the_wrench_of_c_mujoco(cone, condim):
-    model, data = moving(cone, condim)
-    m = mjx.put_model(model)
-    d = jax.jit(mjx.forward)(m, mjx.put_data(model, data))
-    for own in ("plane", "ball"):
-        truth = physics.wrench(model, data, own)
-        both = jax.jit(jax.vmap(lambda d, own=own: physics.wrench(m, d, own)))(jax.tree.map(lambda x: x[None], d))
-        np.testing.assert_allclose(both[0], truth, atol=2e-3 * np.abs(truth).max())
+    truth = physics.wrench(model, data, "plane")
+    batch = jax.vmap(lambda d: physics.wrench(mjx_model, d, "plane"))(jax.tree.map(lambda x: x[None], in_mjx))
+    np.testing.assert_allclose(batch[0], truth, atol=2e-3 * np.abs(truth).max())
 
 
 @pytest.mark.parametrize(("cone", "condim"), [("elliptic", 1), *KINDS])
@@ -82,26 +74,20 @@ def test_mjx_gives_the_wrench_of_c_mujoco(cone, condim):
 def test_a_pressed_box_is_in_balance(cone, condim, push):
     model = model_of(cone, condim)
     data = mujoco.MjData(model)
-    if condim == 1:
-        push = push * [0, 0, 1, 1, 1, 0]  # without friction, the plane carries neither sliding nor spin
-    elif condim == 3:
-        push = push * [1, 1, 1, 1, 1, 0.5]
+    # Without friction, the plane carries neither sliding nor spin.
+    push = push * {1: [0, 0, 1, 1, 1, 0], 3: [1, 1, 1, 1, 1, 0.5]}.get(condim, 1)
     data.body("box").xfrc_applied[:] = push  # at the centre of mass
     mujoco.mj_step(model, data, 3000)
     mujoco.mj_forward(model, data)
     com = data.body("box").xipos
     load = push[:3] - [0, 0, MASS * G]
     expected = -np.concatenate([load, push[3:] + np.cross(com, load)])
-    np.testing.assert_allclose(physics.wrench(model, data, "plane"), expected + _ball(model, data), atol=2e-4)
+    weight = np.array([0, 0, 0.1 * G])  # of the ball, which rests on the same plane
+    ball = np.concatenate([weight, np.cross(data.body("ball").xipos, weight)])
+    np.testing.assert_allclose(physics.wrench(model, data, "plane"), expected + ball, atol=2e-4)
     if not push.any():  # the force acts under the centre of mass
         centre = np.array([-expected[4], expected[3]]) / (MASS * G)
         np.testing.assert_allclose(centre, com[:2], atol=1e-9)
-
-
-def _ball(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """The weight of the ball, which rests on the same plane."""
-    weight = np.array([0, 0, 0.1 * G])
-    return np.concatenate([weight, np.cross(data.body("ball").xipos, weight)])
 
 
 def test_contacts_among_the_geoms_do_not_count_and_actions_equal_reactions():

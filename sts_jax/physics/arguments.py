@@ -13,7 +13,7 @@ from sts_jax.sensor import Sensor
 
 
 def listed(body: Any) -> list[Any]:
-    """Convert one body, or a sequence of bodies, to a list. The items are not checked."""
+    """A list of one body or of a sequence of bodies."""
     return list(body) if isinstance(body, Sequence) and not isinstance(body, str) else [body]
 
 

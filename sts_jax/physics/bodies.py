@@ -77,10 +77,7 @@ class Rigid(NamedTuple):
 def rigids(bodies: Sequence[Body], which: Int[np.ndarray, "n"], hidden: Hidden) -> Rigid:
     """Mass properties and friction of bodies with n sets of hidden properties (see `objects.rigid`).
 
-    Args:
-        bodies: All bodies.
-        which: Index of the body of each set, in ascending order.
-        hidden: The n sets.
+    `which` is the index of the body of each set, in ascending order.
     """
     values = jax.tree.map(np.asarray, hidden)
     groups = [np.flatnonzero(which == index) for index in np.unique(which)]

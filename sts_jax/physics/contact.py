@@ -55,15 +55,11 @@ class Contacts(NamedTuple):
 
 
 def hull(parts: np.ndarray) -> Hull:
-    """Hull of p convex parts, (p, n, 3) (m), padded to n vertices, 3 n - 6 edges and 2 n - 4 faces per part.
-
-    Repeated points have no effect. Raises a ValueError if the points of a part span no volume.
-    """
+    """Hull of p convex parts, (p, n, 3) (m), padded to n vertices, 3 n - 6 edges and 2 n - 4 faces per part."""
     return jax.tree.map(lambda *x: np.stack(x, axis=-2), *(_part(part) for part in parts))
 
 
 def _part(vertices: np.ndarray) -> Hull:
-    """Compute the vertices, edges and face planes of one part. The arrays lack the axis of parts."""
     points = np.asarray(vertices, np.float64)
     try:
         convex = ConvexHull(points)
@@ -132,10 +128,8 @@ def _crossing(ends: Float[Array, "2 3 e"], half: Float[Array, "2"], axis: int, s
 
 
 def _through_top(edges: _Crossing, half: Float[Array, "2"], axis: int, sign: float) -> Bool[Array, "e"]:
-    """Whether each edge entered the box through the top and not through a side.
-
-    It did if its inner end lies above the box, inside it and nearer to the top than to a side, or beyond its far side.
-    """
+    """Whether each edge entered the box through the top and not through a side."""
+    # Its inner end lies above the box, inside it and nearer to the top than to a side, or beyond its far side.
     inner = edges.inner
     cut = jnp.abs(sign * half[axis] - inner[axis])
     aside = jnp.abs(edges.to_corner) * cut / jnp.sqrt(jnp.maximum(edges.to_corner**2 + cut**2, 1e-12))
@@ -180,9 +174,9 @@ def _corners(planes: Float[Array, "4 f"], half: Float[Array, "2"]) -> _Candidate
 
 
 def _spread(depth: Float[Array, "c"], across: Float[Array, "2 c"], num: int) -> Int[Array, "k"]:
-    """Choose `num` contact points: the two deepest, over which the object tips, and the farthest in fixed directions.
+    """Choose the `num` contact points of `collide`, which lie far apart in the coordinates `across` (m).
 
-    `across` are the coordinates (m) in which the points shall lie far apart. An index can occur more than once.
+    The object tips over the two deepest points. An index can occur more than once.
     """
     deepest = jnp.max(depth)
     candidate = depth > jnp.maximum(0, deepest - SKIN)
@@ -203,7 +197,6 @@ def _spread(depth: Float[Array, "c"], across: Float[Array, "2 c"], num: int) -> 
 
 
 def _frame(normal: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """Compute the contact frame, whose rows are the normal and two tangents."""
     other = jnp.where(jnp.abs(normal[1]) < 0.5, jnp.array([0.0, 1.0, 0.0]), jnp.array([0.0, 0.0, 1.0]))
     tangent = geometry.normalize(other - normal * (normal @ other))
     return jnp.stack([normal, tangent, jnp.cross(normal, tangent)])
@@ -216,7 +209,7 @@ def collide(
     num: int = PAD_CONTACTS,
     plane: tuple[int, int] = (0, 1),
 ) -> Contacts:
-    """Find the contacts between an object and a box whose top is centred at the origin.
+    """Find `num` contacts between an object and a box whose top is centred at the origin.
 
     A candidate can become a contact if its depth is above 0 and above the largest depth minus `SKIN`. The first contact
     is the deepest candidate. The second is the deepest that is more than `APART` away from the first. For each of
@@ -229,9 +222,6 @@ def collide(
         half: Half the size of the box along x and y (m). It is infinitely deep.
         num: Number of contacts, >= 2.
         plane: The two axes along which distances and directions are measured.
-
-    Returns:
-        `num` contacts in the frame of the box's top. `dist` is 1 m where there is none.
     """
     rotation, place = geometry.quat_to_matrix(pose[3:]), pose[:3, None]
     points = turned(rotation, jnp.reshape(body.vertices, (3, -1))) + place

@@ -89,10 +89,7 @@ def drawn_fields(
     constants: Contact,
     wall: float,
 ) -> dict[str, np.ndarray]:
-    """Fields of MJX's model that depend on the hidden properties, by name, with a leading axis of n draws.
-
-    They are read from a model of C MuJoCo, which derives them from the mass properties and the friction of each draw.
-    """
+    """Fields of MJX's model (`scene.drawn`) of n draws, which C MuJoCo derives from their hidden properties."""
     original, like, _ = scene.template(pad, constants, wall)
     model = copy.copy(original)
     data = mujoco.MjData(model)

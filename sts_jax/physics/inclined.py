@@ -36,11 +36,9 @@ CLEARANCE = 0.001  # m, smallest distance of a start on the slope from the stop 
 class Inclined(Scenario):
     """An object starts at rest on the tilted pad, or is released just above it. Downhill is +y, with a stop wall.
 
-    The contents have settled earlier in another, random orientation (`tilt`), and do not move on the slope. For a start
-    at rest, the centre of pressure in frame 0 reveals their place, and the weight alone reveals little.
-
-    In most poses, the contents hardly matter: a flat object stays and a high object tips, wherever its contents lie.
-    A start at rest therefore has that one of several random poses in which the contents matter most for tipping.
+    The contents have settled earlier in another, random orientation (`tilt`), and do not move on the slope. In most
+    poses they hardly matter: a flat object stays and a high object tips, wherever its contents lie. A start at rest
+    therefore has that one of several random poses in which the contents matter most for tipping.
 
     All values are drawn uniformly from the ranges of the fields. Source: the See-Through-your-Skin paper, section "Data
     Collection".

@@ -74,7 +74,6 @@ class _Steps(NamedTuple):
 
     @property
     def moving(self) -> Bool[np.ndarray, "n t"]:
-        """True for all steps from 0 to `gone`, the step after which the object has left the pad."""
         return np.arange(self.qpos.shape[1]) <= self.gone[:, None]
 
 
@@ -100,10 +99,7 @@ def _run(before: Int[np.ndarray, "n"], holds: Bool[np.ndarray, "n t"]) -> Int[np
 
 
 def _gone(qpos: Float[np.ndarray, "n t 7"], points: Float[np.ndarray, "h 3"], lowest: float) -> Int[np.ndarray, "n"]:
-    """Find the first step after which the whole object is GONE_DEPTH below the gel's face, t for none.
-
-    An object whose origin is above `lowest` (m) cannot be so deep and is not tested.
-    """
+    """Find the first step after which the whole object is GONE_DEPTH below the gel's face, t for none."""
     low = qpos[..., 2] < lowest
     gone = np.zeros(low.shape, bool)
     w, x, y, z = qpos[low][:, 3:].T
@@ -113,7 +109,6 @@ def _gone(qpos: Float[np.ndarray, "n t 7"], points: Float[np.ndarray, "h 3"], lo
 
 
 def _count(steps: _Steps, counts: _Counts, timestep: float) -> _Counts:
-    """The counts after some steps, from those before them."""
     speed, turn = (np.linalg.norm(steps.qvel[..., part], axis=-1) for part in (slice(3), slice(3, 6)))
     sensors, moving = steps.sensors, steps.moving
     touched = (np.any(sensors[..., _PAD], axis=-1) | np.any(sensors[..., _WALL], axis=-1)) & moving
@@ -164,7 +159,7 @@ class _Simulation(NamedTuple):
 
     batch: mujoco.batch.Batch
     points: Float[np.ndarray, "h 3"]  # m, vertices of the hull in the mesh frame
-    lowest: float  # m, see `_gone`
+    lowest: float  # m, an object whose origin is higher cannot have left the pad
     change: Float[np.ndarray, "n f s 3"]  # N, weight in each step minus the weight in the final step
     timestep: float  # s
     records: Record
@@ -190,11 +185,7 @@ def roll(
         start: Starts of the n trajectories.
         gravity: Gravity in the s time steps that lead to each of the f frames (m/s^2, sensor frame).
         velocity: Velocity on release in the sensor frame (m/s, rad/s). None for objects at rest.
-        freeze: True to end the simulation of an object that has been slower than 1 mm/s and 0.02 rad/s for 0.5 s under
-            constant gravity. It keeps its pose and wrench, and its velocity becomes 0.
-
-    Returns:
-        The ends, and one record per trajectory and frame.
+        freeze: True to end the simulation of a still object (STILL_TIME), which keeps its pose and wrench.
     """
     count, frames, steps, _ = gravity.shape
     worlds = _simulation(models, points, start, gravity, np.zeros((count, 6)) if velocity is None else velocity)
@@ -218,8 +209,7 @@ def roll(
         active = np.setdiff1d(active, ended)
         if not len(active):
             break
-    finite = _finite(worlds)
-    ends = Ends(counts.gone, counts.slow, counts.touches, counts.sunk, finite)
+    ends = Ends(counts.gone, counts.slow, counts.touches, counts.sunk, _finite(worlds))
     return ends, Record(*(x if x.dtype == bool else x.astype(np.float32) for x in worlds.records))
 
 
@@ -267,10 +257,7 @@ def _simulation(
 def _advance(
     worlds: _Simulation, counts: _Counts, which: Int[np.ndarray, "k"], begin: int, end: int, per_frame: int
 ) -> _Counts:
-    """Simulate the worlds `which` from frame `begin` to `end` and write their records. Returns all counts.
-
-    `per_frame` is the number of steps to simulate at the end of each frame's interval.
-    """
+    """Simulate `per_frame` steps for each of the frames from `begin` to `end` in the worlds `which`."""
     steps = worlds.change.shape[2]
     push = np.zeros((len(which), (end - begin) * per_frame, 2, 6))
     push[:, :, 1, :3] = worlds.change[which, begin:end, steps - per_frame :].reshape(len(which), -1, 3)

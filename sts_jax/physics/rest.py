@@ -1,7 +1,7 @@
 """A body at rest or held on the flat pad: its stable faces, its pose, and the wrench of the pad."""
 
 import math
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,6 @@ from sts_jax.sensor import Sensor
 UPRIGHT = math.radians(1)  # rad, largest lean of a body that counts as upright
 DEEPEST = 0.98  # largest depth of a held object, as a share of the gel's largest depth
 HALVINGS = 50  # bisection steps for the depth
-
 
 _rigid = jax.jit(objects.rigid)
 _transform = jax.jit(geometry.transform)
@@ -116,9 +115,7 @@ def place(
         yaw: Rotation about the sensor's z axis (rad). At 0, the +z axis of a lying body points to the top of the image.
             If the body stands upright or upside down, its -y axis points there instead.
         position: x and y of the centre of the body's bounding box (m).
-        fill: Share of the interior's volume that is filled.
-        shell_scale: Factor on the shell's mass.
-        up: Direction that was up when the contents settled, as a unit vector in the mesh frame.
+        fill, shell_scale, up: Those of `stable_faces`.
     """
     _check_body(body)
     if not isinstance(sensor, Sensor):
@@ -172,13 +169,7 @@ def _index(faces: StableFaces, face: int | str) -> int:
     return int(face)
 
 
-def _check_numbers(
-    yaw: float,
-    position: tuple[float, float],
-    fill: float,
-    shell_scale: float,
-    up: tuple[float, float, float],
-) -> None:
+def _check_numbers(yaw: Any, position: Any, fill: Any, shell_scale: Any, up: Any) -> None:
     given = {"yaw": (yaw, ()), "position": (position, (2,)), "fill": (fill, ()), "shell_scale": (shell_scale, ())}
     for name, (value, shape) in (given | {"up": (up, (3,))}).items():
         array = np.asarray(value)

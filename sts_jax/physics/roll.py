@@ -50,13 +50,7 @@ class Record(NamedTuple):
 
 
 def initial(pose: Float[Array, "7"], velocity: Float[Array, "6"], held: Int[Array, ""] | int = 0) -> State:
-    """Create the state before the first time step.
-
-    Args:
-        pose: Mesh frame in the sensor frame.
-        velocity: Velocity on release in the sensor frame: m/s, rad/s.
-        held: Number of time steps until the release.
-    """
+    """Create the state before the first of `held` time steps until the release with a velocity (sensor frame)."""
     turn = velocity[3:] @ geometry.quat_to_matrix(pose[3:])
     zero = jnp.zeros((), jnp.int32)
     return State(
@@ -110,10 +104,7 @@ def _depth(points: Float[Array, "3 h"], model: mjx.Model) -> Float[Array, ""]:
 
 
 def step(model: mjx.Model, data: mjx.Data, hull: Hull, state: State, gravity: Float[Array, "3"]) -> State:
-    """Advance a state by one time step under a gravity (m/s^2, sensor frame).
-
-    An object that is held, or that has left the pad, does not move, and its wrench is 0.
-    """
+    """Advance a state by one time step under a gravity (m/s^2, sensor frame)."""
     old = state
     model = model.tree_replace({"opt.gravity": gravity})
     data = data.replace(qpos=old.qpos, qvel=old.qvel, qacc_warmstart=old.warmstart)
@@ -180,10 +171,7 @@ def roll(
     state: State,
     gravity: Float[Array, "frames steps 3"],
 ) -> tuple[State, Record]:
-    """Simulate one trajectory, and record a frame at the end of each interval of `steps` time steps.
-
-    `gravity` is in m/s^2 in the sensor frame. Returns the last state, and one record per frame.
-    """
+    """Simulate one trajectory under gravity (m/s^2, sensor frame), and record a frame after each interval of steps."""
 
     def interval(state: State, gravity: Float[Array, "steps 3"]) -> tuple[State, Record]:
         state = state._replace(wrenches=jnp.zeros(6), loaded=jnp.zeros((), jnp.int32))

@@ -129,11 +129,7 @@ class Scenario(abc.ABC):
 
     @abc.abstractmethod
     def gravity(self, time: Float[Array, ""], condition: Float[Array, "c"]) -> Float[Array, "3"]:
-        """Gravity minus the acceleration of the pad in the time step from `time` on (s, 0 at frame 0).
-
-        Returns:
-            m/s^2, sensor frame.
-        """
+        """Gravity minus the acceleration of the pad (m/s^2, sensor frame) in the time step from `time` on (s)."""
 
     @abc.abstractmethod
     def outcome(self, first: Float[Array, "7"], last: Float[Array, "7"]) -> Int[Array, ""]:
@@ -232,7 +228,6 @@ def _check_kinds(scenario: Scenario) -> None:
 
 
 def _check_kind(name: str, value: object, default: object) -> None:
-    """Raise a ValueError unless a value is a number, a whole number, two numbers or a `Contact` like its default."""
     pair = isinstance(default, tuple) and len(default) == 2 and all(map(_is_number, default))
     if isinstance(default, Contact):
         fits, wanted = isinstance(value, Contact), "a physics.Contact"
@@ -271,7 +266,6 @@ def check_length(name: str, value: float) -> None:
 
 
 def _check_times(scenario: Scenario) -> None:
-    """Raise a ValueError unless there is a frame, and the interval of a frame is a whole number of time steps."""
     rate, timestep = scenario.rate, scenario.contact.timestep
     if not rate > 0 or not timestep > 0:
         raise ValueError(f"scenario.rate is {rate}/s and scenario.contact.timestep is {timestep} s: both must be > 0")
@@ -286,7 +280,6 @@ def _check_times(scenario: Scenario) -> None:
 
 
 def _check_meanings(scenario: Scenario) -> None:
-    """Raise a ValueError unless the numbers of the outcomes are unique and vectors come first in the condition."""
     numbers = [int(outcome) for outcome in scenario.outcomes]
     if int(Outcome.FELL_OFF) not in numbers:
         raise ValueError(f"scenario.outcomes is {scenario.outcomes}: add physics.Outcome.FELL_OFF")
@@ -310,11 +303,8 @@ _AnyScenario = TypeVar("_AnyScenario", bound=Scenario)
 def variant(scenario: _AnyScenario, name: str) -> _AnyScenario:
     """Return a copy of a scenario with other ranges of its hidden properties.
 
-    Args:
-        scenario: Scenario to copy.
-        name: "default" changes nothing. "off" fixes each hidden property at the middle of its range, with the contents
-            at the base. "wide-friction" draws friction from 0.3 to 0.9. "off-centre" freezes the contents on any side
-            of the object (`tilt` = pi).
+    "off" fixes each hidden property at the middle of its range, with the contents at the base. "wide-friction" draws
+    friction from 0.3 to 0.9. "off-centre" freezes the contents on any side of the object (`tilt` = pi).
     """
     middle = {field: (sum(getattr(scenario, field)) / 2,) * 2 for field in _RANGES}
     changes: dict[str, dict[str, Any]] = {

@@ -120,11 +120,7 @@ def _xml(pad: tuple[float, float], wall: float, contact: Contact, shapes: list[s
 def compile_scene(parts: np.ndarray, pad: tuple[float, float], contact: Contact, wall: float = 0.0) -> mujoco.MjModel:
     """Compile the scene for C MuJoCo, which finds the contacts. `set_rigid` replaces its placeholder masses.
 
-    Args:
-        parts: Points of the convex parts of the object, (p, n, 3), in the mesh frame (m).
-        pad: Size of the pad along x and y (m).
-        contact: Contact and solver constants.
-        wall: Height of the stop wall (m), 0 for none.
+    `parts` are the points of the object's convex parts, (p, n, 3) (m).
     """
     return mujoco.MjModel.from_xml_string(scene_xml(parts, pad, contact, wall))
 
@@ -142,18 +138,12 @@ def scene_xml(parts: np.ndarray, pad: tuple[float, float], contact: Contact, wal
 def set_rigid(
     model: mujoco.MjModel, data: mujoco.MjData, mass: float, com: np.ndarray, inertia: np.ndarray, friction: float
 ) -> None:
-    """Write the mass properties and the friction of an object into a model, as described by `bodies.Rigid`.
-
-    All constants that MuJoCo derives from these values are updated, too (`mj_setConst`). Outdated constants would
-    change the stiffness of the contacts.
-    """
-    if not (np.isfinite(mass) and mass > 0):
-        raise ValueError(f"mass is {mass} kg, but it must be positive and finite")
-    if not (np.isfinite(friction) and friction > 0):
-        raise ValueError(f"friction is {friction}, but it must be positive and finite")
-    for name, value in (("com", com), ("inertia", inertia)):
-        if not np.isfinite(value).all():
-            raise ValueError(f"{name} is {np.asarray(value).tolist()}, but all its values must be finite")
+    """Write the values of a `bodies.Rigid` into a model, with all constants that MuJoCo derives from them."""
+    for name, value in (("mass", mass), ("friction", friction)):
+        if not (np.isfinite(value) and value > 0):
+            raise ValueError(f"{name} is {value}, but it must be positive and finite")
+    if not (np.isfinite(com).all() and np.isfinite(inertia).all()):
+        raise ValueError(f"com is {com} and inertia is {inertia}, but all their values must be finite")
     principal, axes = (x[..., ::-1].copy() for x in np.linalg.eigh(inertia))  # largest first, as in MuJoCo
     if principal[2] <= 0:
         raise ValueError(f"principal moments of inertia are {principal} kg m^2, but they must be positive")
@@ -164,7 +154,7 @@ def set_rigid(
     body.inertia = principal
     mujoco.mju_mat2Quat(model.body_iquat[body.id], axes.ravel())
     model.geom_friction[model.geom_bodyid > 0, 0] = friction
-    mujoco.mj_setConst(model, data)
+    mujoco.mj_setConst(model, data)  # outdated constants would change the stiffness of the contacts
     model.stat.meaninertia = model.dof_M0.mean()  # scales the solver's tolerance. Only the compiler sets it
 
 
@@ -188,8 +178,7 @@ def template(
 ) -> tuple[mujoco.MjModel, mjx.Model, mjx.Data]:
     """The scene that MJX uses for all objects: MuJoCo's model, MJX's model and MJX's data.
 
-    The model has small boxes in place of an object. For each box, MJX reserves memory for four contacts with the pad or
-    the wall. The contacts of an object come from `collide`, not from the boxes.
+    The model has small boxes in place of an object: for each, MJX reserves memory for four contacts of `collide`.
     """
     box, of_wall = 'type="box" size=".01 .01 .01"', 'contype="2" conaffinity="2"'
     shapes = [box] * (PAD_CONTACTS // 4) + [f"{box} {of_wall}"] * (WALL_CONTACTS // 4 if wall else 0)
@@ -206,10 +195,9 @@ def drawn(model: mujoco.MjModel, like: mjx.Model) -> dict[str, np.ndarray]:
 def _sound_solver() -> ModuleType:
     """Load a copy of MJX 3.17's solver whose line search never computes NaN.
 
-    At each step length alpha, the line search computes the root of |u + alpha v|^2 = uu + alpha (2 uv + alpha vv). Here
-    u is the tangential part of a contact's residual, and v is the change of u along the search direction. In float32
-    the sum can be negative where the tangential part is zero, as in free fall, and the search then stops. In one of six
-    drops without spin, the first touch missed part of the contact's force. Velocities were wrong by up to 0.15 m/s.
+    At each step length alpha, the line search computes the root of |u + alpha v|^2 = uu + alpha (2 uv + alpha vv), with
+    the tangential part u of a contact's residual and its change v along the search direction. In float32 the sum can be
+    negative where u is zero, as in free fall, and the search then stops: velocities were wrong by up to 0.15 m/s.
     """
     spec = importlib.util.find_spec("mujoco.mjx._src.solver")
     assert spec is not None

@@ -109,12 +109,9 @@ def draw(
 
     Args:
         key: Key of all draws.
-        body: Index of the body of each draw.
+        body: Index of the body of each draw, among those of `shapes`.
         nth: Number of each draw among those of the same body, from 0.
         attempt: Number of earlier draws of the trajectory that failed.
-        shapes: Geometry of all bodies, with a leading axis of bodies.
-        scenario: The scenario that draws.
-        pad: Size of the pad along x and y (m).
     """
 
     def one(body: ArrayLike, nth: ArrayLike, attempt: ArrayLike) -> tuple[Start, Hidden]:
@@ -298,11 +295,7 @@ def _trajectory(setup: Setup, sensor: Sensor, accepted: _Accepted) -> Trajectory
     starts = accepted.starts
     return Trajectory(
         time=jnp.tile(jnp.arange(scenario.frames) / scenario.rate, (len(setup.which), 1)),
-        pose=record.pose,
-        velocity=record.velocity,
-        wrench=record.wrench,
-        contact=record.contact,
-        wall=record.wall,
+        **record._asdict(),
         gravity=gravity,
         settled=ends.gone | (ends.slow * scenario.contact.timestep >= SLOW_TIME),
         outcome=outcome,
@@ -334,5 +327,4 @@ def starts(
 
 
 def _named(number: int) -> str:
-    """Return an outcome in words, or as "outcome N" if `Outcome` has no member with this number."""
     return str(Outcome(number)) if number in set(Outcome) else f"outcome {number}"
