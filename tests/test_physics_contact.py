@@ -33,7 +33,7 @@ def in_c(model: mujoco.MjModel, data: mujoco.MjData, pose: np.ndarray) -> tuple[
     if not data.ncon:
         return 1.0, np.zeros(3), np.zeros(3)
     deepest = int(np.argmin(data.contact.dist))
-    return data.contact.dist[deepest], data.contact.frame[deepest, :3], data.contact.pos[deepest]
+    return data.contact.dist[deepest], data.contact.frame[deepest, :3].copy(), data.contact.pos[deepest].copy()
 
 
 def height_at(model: mujoco.MjModel, pose: np.ndarray, depth: float, low: float, high: float) -> np.ndarray:
