@@ -12,7 +12,13 @@ ROOMS = [
     (name, re.findall(r"`([^`]+)`", paths), int(lines.replace(",", "")), int(budget.replace(",", "")))
     for name, paths, lines, budget in re.findall(r"^\| ([^|`]+) \| (`[^|]+) \| ([\d,]+) \| ([\d,]+) \|$", PAGE, re.M)
 ]
-TOTALS = {"library without hardware": 17_500, "hardware": 4_800, "experiments": 3_000, "benchmarks": 4_500, "tests": 16_000}
+TOTALS = {
+    "library without hardware": 17_500,
+    "hardware": 4_800,
+    "experiments": 3_000,
+    "benchmarks": 4_500,
+    "tests": 16_000,
+}
 
 
 def _files(paths):

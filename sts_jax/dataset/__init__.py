@@ -1,34 +1,24 @@
 """Datasets on disk: `collect` simulates, renders and writes them, and `load` reads them as arrays."""
 
-from sts_jax.dataset.collecting import Collected, Progress, collect
-from sts_jax.dataset.collection import Collection, class_names, make_bodies, split_objects
-from sts_jax.dataset.loading import Dataset, Ends, Pairs, Views, load, reduced, reduced_images
-from sts_jax.dataset.measurement import Measurement
-from sts_jax.dataset.meshes import Meshes, mesh_classes, survey_meshes
-from sts_jax.dataset.records import Images
-from sts_jax.dataset.rendering import empty_frame, frames_per_call, render_uint8
-
-__all__ = [
-    "Collected",
-    "Collection",
-    "Dataset",
-    "Ends",
-    "Images",
-    "Measurement",
-    "Meshes",
-    "Pairs",
-    "Progress",
-    "Views",
-    "class_names",
-    "collect",
-    "empty_frame",
-    "frames_per_call",
-    "load",
-    "make_bodies",
-    "mesh_classes",
-    "reduced",
-    "reduced_images",
-    "render_uint8",
-    "split_objects",
-    "survey_meshes",
-]
+from sts_jax.dataset.collecting import Collected as Collected
+from sts_jax.dataset.collecting import Progress as Progress
+from sts_jax.dataset.collecting import collect as collect
+from sts_jax.dataset.collection import Collection as Collection
+from sts_jax.dataset.collection import class_names as class_names
+from sts_jax.dataset.collection import make_bodies as make_bodies
+from sts_jax.dataset.collection import split_objects as split_objects
+from sts_jax.dataset.loading import Dataset as Dataset
+from sts_jax.dataset.loading import Ends as Ends
+from sts_jax.dataset.loading import Pairs as Pairs
+from sts_jax.dataset.loading import Views as Views
+from sts_jax.dataset.loading import load as load
+from sts_jax.dataset.loading import reduced as reduced
+from sts_jax.dataset.loading import reduced_images as reduced_images
+from sts_jax.dataset.measurement import Measurement as Measurement
+from sts_jax.dataset.meshes import Meshes as Meshes
+from sts_jax.dataset.meshes import mesh_classes as mesh_classes
+from sts_jax.dataset.meshes import survey_meshes as survey_meshes
+from sts_jax.dataset.records import Images as Images
+from sts_jax.dataset.rendering import empty_frame as empty_frame
+from sts_jax.dataset.rendering import frames_per_call as frames_per_call
+from sts_jax.dataset.rendering import render_uint8 as render_uint8

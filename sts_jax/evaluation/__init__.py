@@ -1,73 +1,41 @@
 """Evaluation of predictions: errors, metrics, baselines, the best possible prediction, tables and figures."""
 
-from sts_jax.evaluation import figures, gap, metrics
-from sts_jax.evaluation.catalogue import (
-    CALIBRATION,
-    COLUMNS,
-    LOG_LOSS,
-    METRICS,
-    Column,
-    Metric,
-    Scores,
-    measurement_error,
-)
-from sts_jax.evaluation.figures.motion import outside
-from sts_jax.evaluation.images import STREAMS, image_summary
-from sts_jax.evaluation.predictions import (
-    TRUE_STATE,
-    Predicted,
-    emptiness,
-    first,
-    frequency,
-    joined,
-    outcome_of_pose,
-    predict,
-    rows_of,
-    shares,
-    subsets,
-    train_share,
-)
-from sts_jax.evaluation.references import BASELINES, CEILING, CEILINGS, ONE_REROLL, baselines, ceiling, image_baselines
-from sts_jax.evaluation.results import full_table, gain, score, scorer, summarise, table
-
-__all__ = [
-    "BASELINES",
-    "CALIBRATION",
-    "CEILING",
-    "CEILINGS",
-    "COLUMNS",
-    "LOG_LOSS",
-    "METRICS",
-    "ONE_REROLL",
-    "STREAMS",
-    "TRUE_STATE",
-    "Column",
-    "Metric",
-    "Predicted",
-    "Scores",
-    "baselines",
-    "ceiling",
-    "emptiness",
-    "figures",
-    "first",
-    "frequency",
-    "full_table",
-    "gain",
-    "gap",
-    "image_baselines",
-    "image_summary",
-    "joined",
-    "measurement_error",
-    "metrics",
-    "outcome_of_pose",
-    "outside",
-    "predict",
-    "rows_of",
-    "score",
-    "scorer",
-    "shares",
-    "subsets",
-    "summarise",
-    "table",
-    "train_share",
-]
+from sts_jax.evaluation import figures as figures
+from sts_jax.evaluation import gap as gap
+from sts_jax.evaluation import metrics as metrics
+from sts_jax.evaluation.catalogue import CALIBRATION as CALIBRATION
+from sts_jax.evaluation.catalogue import COLUMNS as COLUMNS
+from sts_jax.evaluation.catalogue import LOG_LOSS as LOG_LOSS
+from sts_jax.evaluation.catalogue import METRICS as METRICS
+from sts_jax.evaluation.catalogue import Column as Column
+from sts_jax.evaluation.catalogue import Metric as Metric
+from sts_jax.evaluation.catalogue import Scores as Scores
+from sts_jax.evaluation.catalogue import measurement_error as measurement_error
+from sts_jax.evaluation.figures.motion import outside as outside
+from sts_jax.evaluation.images import STREAMS as STREAMS
+from sts_jax.evaluation.images import image_summary as image_summary
+from sts_jax.evaluation.predictions import TRUE_STATE as TRUE_STATE
+from sts_jax.evaluation.predictions import Predicted as Predicted
+from sts_jax.evaluation.predictions import emptiness as emptiness
+from sts_jax.evaluation.predictions import first as first
+from sts_jax.evaluation.predictions import frequency as frequency
+from sts_jax.evaluation.predictions import joined as joined
+from sts_jax.evaluation.predictions import outcome_of_pose as outcome_of_pose
+from sts_jax.evaluation.predictions import predict as predict
+from sts_jax.evaluation.predictions import rows_of as rows_of
+from sts_jax.evaluation.predictions import shares as shares
+from sts_jax.evaluation.predictions import subsets as subsets
+from sts_jax.evaluation.predictions import train_share as train_share
+from sts_jax.evaluation.references import BASELINES as BASELINES
+from sts_jax.evaluation.references import CEILING as CEILING
+from sts_jax.evaluation.references import CEILINGS as CEILINGS
+from sts_jax.evaluation.references import ONE_REROLL as ONE_REROLL
+from sts_jax.evaluation.references import baselines as baselines
+from sts_jax.evaluation.references import ceiling as ceiling
+from sts_jax.evaluation.references import image_baselines as image_baselines
+from sts_jax.evaluation.results import full_table as full_table
+from sts_jax.evaluation.results import gain as gain
+from sts_jax.evaluation.results import score as score
+from sts_jax.evaluation.results import scorer as scorer
+from sts_jax.evaluation.results import summarise as summarise
+from sts_jax.evaluation.results import table as table

@@ -1,52 +1,31 @@
 """Rigid objects for the simulation and the renderer, generated from a random key or loaded from mesh files."""
 
-from sts_jax.objects.body import (
-    CATEGORIES,
-    FACE_CLASSES,
-    HULL_CLASSES,
-    PART_CLASSES,
-    TEXTURE_CLASSES,
-    Body,
-    fill_moments,
-    mirror,
-    rigid,
-    stack,
-)
-from sts_jax.objects.hulls import DIRECTIONS, lattice, rest_poses, support
-from sts_jax.objects.items import Entry, Item, Library
-from sts_jax.objects.libraries import HOLLOW, bodies, facts, library, read, survey
-from sts_jax.objects.meshes import load
-from sts_jax.objects.parts import decompose, gaps
-from sts_jax.objects.procedural import Family, find_family, make
-
-__all__ = [
-    "CATEGORIES",
-    "DIRECTIONS",
-    "FACE_CLASSES",
-    "HOLLOW",
-    "HULL_CLASSES",
-    "PART_CLASSES",
-    "TEXTURE_CLASSES",
-    "Body",
-    "Entry",
-    "Family",
-    "Item",
-    "Library",
-    "bodies",
-    "decompose",
-    "facts",
-    "fill_moments",
-    "find_family",
-    "gaps",
-    "lattice",
-    "library",
-    "load",
-    "make",
-    "mirror",
-    "read",
-    "rest_poses",
-    "rigid",
-    "stack",
-    "support",
-    "survey",
-]
+from sts_jax.objects.body import CATEGORIES as CATEGORIES
+from sts_jax.objects.body import FACE_CLASSES as FACE_CLASSES
+from sts_jax.objects.body import HULL_CLASSES as HULL_CLASSES
+from sts_jax.objects.body import PART_CLASSES as PART_CLASSES
+from sts_jax.objects.body import TEXTURE_CLASSES as TEXTURE_CLASSES
+from sts_jax.objects.body import Body as Body
+from sts_jax.objects.body import fill_moments as fill_moments
+from sts_jax.objects.body import mirror as mirror
+from sts_jax.objects.body import rigid as rigid
+from sts_jax.objects.body import stack as stack
+from sts_jax.objects.hulls import DIRECTIONS as DIRECTIONS
+from sts_jax.objects.hulls import lattice as lattice
+from sts_jax.objects.hulls import rest_poses as rest_poses
+from sts_jax.objects.hulls import support as support
+from sts_jax.objects.items import Entry as Entry
+from sts_jax.objects.items import Item as Item
+from sts_jax.objects.items import Library as Library
+from sts_jax.objects.libraries import HOLLOW as HOLLOW
+from sts_jax.objects.libraries import bodies as bodies
+from sts_jax.objects.libraries import facts as facts
+from sts_jax.objects.libraries import library as library
+from sts_jax.objects.libraries import read as read
+from sts_jax.objects.libraries import survey as survey
+from sts_jax.objects.meshes import load as load
+from sts_jax.objects.parts import decompose as decompose
+from sts_jax.objects.parts import gaps as gaps
+from sts_jax.objects.procedural import Family as Family
+from sts_jax.objects.procedural import find_family as find_family
+from sts_jax.objects.procedural import make as make

@@ -1,55 +1,31 @@
 """Motion of objects on the pad, simulated in MuJoCo (`simulate`), and poses of objects at rest (`place`)."""
 
-from sts_jax.physics.bodies import BodyError, Rigid, refusal, rigids
-from sts_jax.physics.engines import Engine
-from sts_jax.physics.forces import wrench
-from sts_jax.physics.freefall import Freefall
-from sts_jax.physics.inclined import Inclined
-from sts_jax.physics.perturbed import Perturbed
-from sts_jax.physics.released import Released
-from sts_jax.physics.rest import Placement, StableFaces, place, stable_faces, weight
-from sts_jax.physics.scenario import (
-    Hidden,
-    Outcome,
-    Quantity,
-    Scenario,
-    Shape,
-    Start,
-    Variant,
-    fell_off,
-    variant,
-)
-from sts_jax.physics.scene import Contact
-from sts_jax.physics.simulation import Starts, Trajectory, simulate, starts
-
-__all__ = [
-    "BodyError",
-    "Contact",
-    "Engine",
-    "Freefall",
-    "Hidden",
-    "Inclined",
-    "Outcome",
-    "Perturbed",
-    "Placement",
-    "Quantity",
-    "Released",
-    "Rigid",
-    "Scenario",
-    "Shape",
-    "StableFaces",
-    "Start",
-    "Starts",
-    "Trajectory",
-    "Variant",
-    "fell_off",
-    "place",
-    "refusal",
-    "rigids",
-    "simulate",
-    "stable_faces",
-    "starts",
-    "variant",
-    "weight",
-    "wrench",
-]
+from sts_jax.physics.bodies import BodyError as BodyError
+from sts_jax.physics.bodies import Rigid as Rigid
+from sts_jax.physics.bodies import refusal as refusal
+from sts_jax.physics.bodies import rigids as rigids
+from sts_jax.physics.engines import Engine as Engine
+from sts_jax.physics.forces import wrench as wrench
+from sts_jax.physics.freefall import Freefall as Freefall
+from sts_jax.physics.inclined import Inclined as Inclined
+from sts_jax.physics.perturbed import Perturbed as Perturbed
+from sts_jax.physics.released import Released as Released
+from sts_jax.physics.rest import Placement as Placement
+from sts_jax.physics.rest import StableFaces as StableFaces
+from sts_jax.physics.rest import place as place
+from sts_jax.physics.rest import stable_faces as stable_faces
+from sts_jax.physics.rest import weight as weight
+from sts_jax.physics.scenario import Hidden as Hidden
+from sts_jax.physics.scenario import Outcome as Outcome
+from sts_jax.physics.scenario import Quantity as Quantity
+from sts_jax.physics.scenario import Scenario as Scenario
+from sts_jax.physics.scenario import Shape as Shape
+from sts_jax.physics.scenario import Start as Start
+from sts_jax.physics.scenario import Variant as Variant
+from sts_jax.physics.scenario import fell_off as fell_off
+from sts_jax.physics.scenario import variant as variant
+from sts_jax.physics.scene import Contact as Contact
+from sts_jax.physics.simulation import Starts as Starts
+from sts_jax.physics.simulation import Trajectory as Trajectory
+from sts_jax.physics.simulation import simulate as simulate
+from sts_jax.physics.simulation import starts as starts

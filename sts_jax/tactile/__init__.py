@@ -4,24 +4,18 @@ The skin is the paint on the gel's outer face. The tactile image shows the inner
 lights are on.
 """
 
-from sts_jax.tactile.gel import Equilibrium, Gel, cell_area, cell_centres, indent, settle
-from sts_jax.tactile.normals import surface_normals
-from sts_jax.tactile.skin import Leds, Lights, Phong, Skin, couple, darken, phong, shadows
-
-__all__ = [
-    "Equilibrium",
-    "Gel",
-    "Leds",
-    "Lights",
-    "Phong",
-    "Skin",
-    "cell_area",
-    "cell_centres",
-    "couple",
-    "darken",
-    "indent",
-    "phong",
-    "settle",
-    "shadows",
-    "surface_normals",
-]
+from sts_jax.tactile.gel import Equilibrium as Equilibrium
+from sts_jax.tactile.gel import Gel as Gel
+from sts_jax.tactile.gel import cell_area as cell_area
+from sts_jax.tactile.gel import cell_centres as cell_centres
+from sts_jax.tactile.gel import indent as indent
+from sts_jax.tactile.gel import settle as settle
+from sts_jax.tactile.normals import surface_normals as surface_normals
+from sts_jax.tactile.skin import Leds as Leds
+from sts_jax.tactile.skin import Lights as Lights
+from sts_jax.tactile.skin import Phong as Phong
+from sts_jax.tactile.skin import Skin as Skin
+from sts_jax.tactile.skin import couple as couple
+from sts_jax.tactile.skin import darken as darken
+from sts_jax.tactile.skin import phong as phong
+from sts_jax.tactile.skin import shadows as shadows

@@ -1,50 +1,31 @@
 """Training of `sts_jax.statespace` and `sts_jax.mvae` models: training arrays, the training loop and model folders."""
 
-from sts_jax.training.arrays import (
-    Arrays,
-    frame_arrays,
-    image_arrays,
-    order,
-    paper_model,
-    shifted,
-    state_arrays,
-    state_codes,
-    state_model,
-)
-from sts_jax.training.config import TrainConfig, optimiser
-from sts_jax.training.folder import TrainState, load_blank, records, restore, save, save_blank, save_calibration
-from sts_jax.training.loop import Learner, Loss, initial, learner, step, train
-from sts_jax.training.model import Model, calibrate, load
-from sts_jax.training.preprocess import Preprocessing, touch_of_noisy_images
-
-__all__ = [
-    "Arrays",
-    "Learner",
-    "Loss",
-    "Model",
-    "Preprocessing",
-    "TrainConfig",
-    "TrainState",
-    "calibrate",
-    "frame_arrays",
-    "image_arrays",
-    "initial",
-    "learner",
-    "load",
-    "load_blank",
-    "optimiser",
-    "order",
-    "paper_model",
-    "records",
-    "restore",
-    "save",
-    "save_blank",
-    "save_calibration",
-    "shifted",
-    "state_arrays",
-    "state_codes",
-    "state_model",
-    "step",
-    "touch_of_noisy_images",
-    "train",
-]
+from sts_jax.training.arrays import Arrays as Arrays
+from sts_jax.training.arrays import frame_arrays as frame_arrays
+from sts_jax.training.arrays import image_arrays as image_arrays
+from sts_jax.training.arrays import order as order
+from sts_jax.training.arrays import paper_model as paper_model
+from sts_jax.training.arrays import shifted as shifted
+from sts_jax.training.arrays import state_arrays as state_arrays
+from sts_jax.training.arrays import state_codes as state_codes
+from sts_jax.training.arrays import state_model as state_model
+from sts_jax.training.config import TrainConfig as TrainConfig
+from sts_jax.training.config import optimiser as optimiser
+from sts_jax.training.folder import TrainState as TrainState
+from sts_jax.training.folder import load_blank as load_blank
+from sts_jax.training.folder import records as records
+from sts_jax.training.folder import restore as restore
+from sts_jax.training.folder import save as save
+from sts_jax.training.folder import save_blank as save_blank
+from sts_jax.training.folder import save_calibration as save_calibration
+from sts_jax.training.loop import Learner as Learner
+from sts_jax.training.loop import Loss as Loss
+from sts_jax.training.loop import initial as initial
+from sts_jax.training.loop import learner as learner
+from sts_jax.training.loop import step as step
+from sts_jax.training.loop import train as train
+from sts_jax.training.model import Model as Model
+from sts_jax.training.model import calibrate as calibrate
+from sts_jax.training.model import load as load
+from sts_jax.training.preprocess import Preprocessing as Preprocessing
+from sts_jax.training.preprocess import touch_of_noisy_images as touch_of_noisy_images

@@ -1,20 +1,14 @@
 """Figures of predictions, training and simulation. Each function writes one file."""
 
-from sts_jax.evaluation.figures.curves import Trained, calibration, ends, scaling, training_curves
-from sts_jax.evaluation.figures.motion import SLOWER, animation, strip
-from sts_jax.evaluation.figures.pictures import SAMPLES, comparison, predictions, side_by_side
-
-__all__ = [
-    "SAMPLES",
-    "SLOWER",
-    "Trained",
-    "animation",
-    "calibration",
-    "comparison",
-    "ends",
-    "predictions",
-    "scaling",
-    "side_by_side",
-    "strip",
-    "training_curves",
-]
+from sts_jax.evaluation.figures.curves import Trained as Trained
+from sts_jax.evaluation.figures.curves import calibration as calibration
+from sts_jax.evaluation.figures.curves import ends as ends
+from sts_jax.evaluation.figures.curves import scaling as scaling
+from sts_jax.evaluation.figures.curves import training_curves as training_curves
+from sts_jax.evaluation.figures.motion import SLOWER as SLOWER
+from sts_jax.evaluation.figures.motion import animation as animation
+from sts_jax.evaluation.figures.motion import strip as strip
+from sts_jax.evaluation.figures.pictures import SAMPLES as SAMPLES
+from sts_jax.evaluation.figures.pictures import comparison as comparison
+from sts_jax.evaluation.figures.pictures import predictions as predictions
+from sts_jax.evaluation.figures.pictures import side_by_side as side_by_side
