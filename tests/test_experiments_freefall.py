@@ -4,10 +4,8 @@ import dataclasses
 import json
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from optics_bodies import public_meshes
 
 import sts_jax as sts
 from experiments import freefall
@@ -135,26 +133,6 @@ def test_the_documented_calls_run(workdir):
     assert out.pose.shape == (7,)
     with pytest.raises(ValueError, match="cannot use tactile"):
         predict(tactile=frame.tactile)
-
-
-def test_a_textured_mesh_falls_and_is_visible_and_leaves_an_imprint():
-    meshes = public_meshes()
-    body = sts.objects.load(meshes / "potion.obj", longest_side=0.08, up="y", texture=meshes / "potion.png")
-    sensor = sts.Sensor()
-    traj = sts.physics.simulate(jax.random.key(2), body, sensor, physics.Freefall(), num=4)
-    rests = np.flatnonzero((traj.outcome == physics.Outcome.RESTS) & traj.settled)
-    assert len(rests) > 0
-    one = int(rests[0])
-    frame = sts.sense(sensor, body, traj.pose[one, -1], traj.wrench[one, -1], resolution=(200, 200))
-    empty = sts.sense(sensor, body, jnp.array([0.0, 0, -1, 1, 0, 0, 0]), jnp.zeros(6), resolution=(200, 200))
-    seen = np.asarray(frame.segmentation)
-    assert seen.mean() > 0.01
-    assert np.asarray(frame.visual)[seen].std(0).max() > 0.03  # a texture, not one colour
-    imprint = np.abs(np.asarray(frame.tactile - empty.tactile)).max(-1) > 5 / 255
-    assert imprint.sum() > 20
-    assert bool(frame.balanced)
-    area = 1e-6
-    assert float(frame.pressure.sum() * area) == pytest.approx(float(traj.wrench[one, -1, 2]), rel=0.01)
 
 
 def test_the_split_of_the_paper_holds_out_a_fifth_of_the_trajectories(workdir):
