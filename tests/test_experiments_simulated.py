@@ -12,7 +12,7 @@ from experiments.shared.device import Hand, Simulated, commissioned, simulate, s
 from sts_jax import hardware
 from sts_jax.hardware import twin
 
-SMALL = {"size": (160, 120), "guide": hardware.GuideConfig(empty_s=0.3, hold_s=0.3, rest_s=0.5)}
+SMALL = {"size": (240, 180), "guide": hardware.GuideConfig(empty_s=0.3, hold_s=0.3, rest_s=0.5)}
 
 
 def ends(workdir):
@@ -52,7 +52,7 @@ def test_an_interrupted_collection_of_the_twin_equals_an_uninterrupted_one(tmp_p
     assert "has 5 trajectories already" in capsys.readouterr().err
     for options, message in (
         ({"seed": 1}, "TWIN1"),
-        ({"size": (320, 240)}, "is for images of 160 x 120 pixels"),
+        ({"size": (320, 240)}, "is for images of 240 x 180 pixels"),
         ({"levels": (9, 9, 9, 9)}, "levels"),
     ):
         with pytest.raises(SystemExit, match=message):
