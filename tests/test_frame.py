@@ -102,6 +102,18 @@ def test_a_hovering_object_is_visible_and_leaves_no_imprint():
 
 
 @pytest.mark.slow
+def test_vmap_agrees_with_single_frames():
+    poses = jnp.stack([at(0.01 * k, -0.005 * k, 0.029) for k in range(3)])
+    wrenches = jnp.stack([weight(0.3 * k, 0.01 * k, -0.005 * k) for k in range(3)])
+    batch = jax.jit(jax.vmap(lambda p, w: sense(SENSOR, ball(), p, w)))(poses, wrenches)
+    for k in range(3):
+        one = sense(SENSOR, ball(), poses[k], wrenches[k])
+        np.testing.assert_allclose(batch.tactile[k], one.tactile, atol=2e-3)
+        np.testing.assert_allclose(batch.visual[k], one.visual, atol=2e-3)
+        assert bool(batch.balanced[k]) == bool(one.balanced)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("crop", [False, True])
 def test_touch_equals_the_tactile_image_of_the_same_imprint(crop):
     skin = sts.tactile.Skin(coupling=0.0004, shadow_steps=8)
