@@ -82,13 +82,11 @@ class Predictor:
         """Load a trained model, after comparing its files with their checksums.
 
         Args:
-            folder: Folder of a model, the `workdir` of a training or a folder that `save` wrote, or the name of a model
-                that comes with the library, such as `freefall`. A folder of this name in the current directory that
-                contains `config.json` comes first.
-            resolution: Height and width of the images that you will pass (pixels). If given, a model that was trained
-                at another resolution raises an error.
+            folder: Folder of a model, or the name of a model that comes with the library, such as `freefall`. A folder
+                of this name in the current directory that contains `config.json` comes first.
+            resolution: Height and width of the images that you will pass (pixels). Another model is refused.
             crop: View of the images that you will pass: True for the square around the object, False for the whole pad.
-                If given, a model that was trained on the other view raises an error.
+                Another model is refused.
         """
         path = _located(folder)
         model = training.load(path)
@@ -122,9 +120,7 @@ class Predictor:
 
         Args:
             folder: New or empty folder.
-            compact: If True, round the weights, which reduces their size on disk to a third. Each weight of an
-                output channel changes by at most r / 256, where r is the root mean square of the channel's weights.
-                Predictions change slightly.
+            compact: If True, round the weights, which reduces their size on disk to a third, see `training.save`.
         """
         folder = Path(folder)
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -161,26 +157,22 @@ class Predictor:
     ) -> Prediction:
         """Predict the last frame of trajectories from their first frames.
 
-        Pass at least one input. All arrays have the same leading axes *n: none for a single item, and any number for a
-        batch. Outside `jax.jit`, an invalid value raises an error. Traced values cannot raise errors: an item with an
-        invalid traced value gives a prediction of NaN. Other items of the batch are not affected.
+        Pass at least one input. All arrays have the same leading axes *n. Outside `jax.jit`, an invalid value raises an
+        error. Inside, an item with an invalid traced value gives a prediction of NaN.
 
         Args:
             visual: Visual images in [0, 1].
-            tactile: Tactile images in [0, 1]. Images without contact are ignored, unless the model was trained with
-                blank tactile images as inputs.
+            tactile: Tactile images in [0, 1]. Images without contact are ignored, see `Preprocessing.touched`.
             pose: Poses of the object: position (m) and unit quaternion, mesh frame in the sensor frame.
             condition: Conditions in SI units, for models that were trained with them. For `Perturbed`: acceleration of
                 the pad along x and y (m/s^2), and its duration (s).
-            state: State codes of the true states, from `statespace.encode`. Only for state-space models. The remaining
-                error is that of the learned physics and of the decoder.
+            state: State codes of the true states, from `statespace.encode`, for state-space models.
             measurements: Values of further modalities (`dataset.Measurement`) by name: vectors in SI units, (*n, size),
                 or images in [0, 1], (*n, height, width, channels).
             present: Masks by the name of the input, False for items in which it is to be ignored. Ignored values may be
                 NaN. By default, all items are used.
             key: Random key that draws the samples. It is needed only if `num_samples` > 0.
-            num_samples: Number of predictions to draw for each item, returned in `Prediction.samples`. If it is > 0,
-                the images of a state-space model's prediction are means over these samples.
+            num_samples: Number of predictions to draw for each item, returned in `Prediction.samples`.
         """
         every = {"visual": visual, "tactile": tactile, "pose": pose, "state": state, **(measurements or {})}
         inputs = {name: self._input(name, value) for name, value in every.items() if value is not None}
@@ -210,12 +202,7 @@ class Predictor:
 
     @checked
     def prior(self, shape: tuple[int, ...] = (), *, condition: Numbers | None = None) -> Prediction:
-        """Predict the last frame of trajectories without any measurement, from the model's prior distribution.
-
-        Args:
-            shape: Sizes of the leading axes of the predictions. The default is a single prediction.
-            condition: Conditions, (*shape, c), as in a call.
-        """
+        """Predict last frames from the model's prior distribution, for leading axes `shape`. Condition as in a call."""
         return self._predicted({}, {}, shape, condition, [], None, 0)
 
     def _predicted(
@@ -236,19 +223,8 @@ class Predictor:
             result = predict(graphdef, state, view, blank, inputs, present, condition, key, num_samples, shape)
         else:
             inputs, present = completed(self._inputs, view.resolution, inputs, present, lead)
-            result = predict_samples(
-                graphdef,
-                state,
-                view,
-                self._empty,
-                inputs,
-                present,
-                condition,
-                key,
-                num_samples,
-                lead,
-                model.calibration,
-            )
+            more = condition, key, num_samples, lead, model.calibration
+            result = predict_samples(graphdef, state, view, self._empty, inputs, present, *more)
         valid = valid if fine is None else [*valid, fine]
         return flagged(result, jnp.all(jnp.stack(valid), axis=0)) if valid else result
 
@@ -330,7 +306,7 @@ def _array(value: Any) -> np.ndarray | Array:
 
 
 def _float32(array: Any) -> Any:
-    """Convert an array to float32. Numbers that are too large become infinite, and a later check rejects them."""
+    """Convert to float32. Numbers that are too large become infinite, and a later check rejects them."""
     with np.errstate(over="ignore"):
         return array.astype(np.float32)
 
@@ -367,7 +343,6 @@ def _reason(name: str, kind: Kind, items: np.ndarray) -> str:
 
 
 def _located(folder: str | Path) -> Path:
-    """Return the folder of a model, given this folder or the name of a model that comes with the library."""
     path, name = Path(folder), str(folder)
     if name != path.name or (path / "config.json").exists():
         return path

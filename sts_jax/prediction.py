@@ -184,19 +184,9 @@ def completed(
     present: dict[str, Any],
     lead: tuple[int, ...],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Add a placeholder with a mask that is False for each input that is not given.
+    """Add a placeholder and a mask that is False for each of `names` that `inputs` lacks.
 
-    One compiled program is therefore enough for all combinations of given inputs.
-
-    Args:
-        names: Names of all inputs of the model.
-        resolution: Height and width of the images (pixels).
-        inputs: Inputs that are given, by name.
-        present: Masks that are given, by name.
-        lead: Sizes of the leading axes of the inputs.
-
-    Returns:
-        All inputs and the mask of each, by name.
+    One compiled program is therefore enough for all combinations of given inputs. `lead` are the leading axes.
     """
     lying = np.array([0, 0, 0, 1, 0, 0, 0], np.float32)
     nothing = {
@@ -227,13 +217,7 @@ def _flat(
 
 
 def flagged(prediction: Prediction, valid: Bool[Array, "*n"], *, leading: int = 0) -> Prediction:
-    """Set all numbers of the invalid items of a prediction to NaN.
-
-    Args:
-        prediction: Prediction, or the samples of a prediction.
-        valid: Mask that is False for the invalid items.
-        leading: Number of axes that images, poses and measurements have before the axes of `valid`, 1 for samples.
-    """
+    """Set the items of a prediction that are not valid to NaN. Samples have `leading` axes before those of `valid`."""
 
     def flag(leaf: Array, axes: int) -> Array:
         return jnp.where(valid.reshape(*valid.shape, *(1,) * axes), leaf, jnp.nan)

@@ -27,16 +27,9 @@ def train(folder, *, absent=(), condition_scale=()):
     preprocessing = training.Preprocessing(resolution=(SIDE, SIDE), absent=absent, condition_scale=condition_scale)
     code = np.asarray(preprocessing.encode_pose(jnp.asarray(pose)))
     moments = {"visual": images[0], "tactile": images[1], "pose": code}
-    config = mvae.Config(
-        tuple(
-            mvae.Modality(name, "vector" if name == "pose" else "image", value.shape[1:])
-            for name, value in moments.items()
-        ),
-        latent=8,
-        hidden=16,
-        widths=(4, 4, 4, 4),
-        condition=len(condition_scale),
-    )
+    kinds = {"visual": "image", "tactile": "image", "pose": "vector"}
+    modalities = tuple(mvae.Modality(name, kind, moments[name].shape[1:]) for name, kind in kinds.items())
+    config = mvae.Config(modalities, latent=8, hidden=16, widths=(4, 4, 4, 4), condition=len(condition_scale))
     condition = rng.normal(size=(6, len(condition_scale))).astype(np.float32) if condition_scale else None
     training.save_blank(folder, images[0, 0], np.full((SIDE, SIDE, 3), 178, np.uint8))
     training.train(
@@ -125,52 +118,24 @@ GIVEN, POSE = measurement(2), measurement()["pose"]
     ("given", "error", "message"),
     [
         ({}, ValueError, "nothing to predict from: give at least one of visual, tactile, pose"),
-        (broken("visual", lambda x: x[:, 1:, :31]), TypeCheckError, "tactile"),
         ({"visual": GIVEN["visual"][:, 1:]}, ValueError, r"has shape \(2, 31, 32, 3\).*resolution=\(32, 32\)"),
         (broken("visual", lambda x: x * 255), ValueError, "visual has values in .*divide by 255"),
         (broken("visual", lambda x: (x * 255).astype(np.uint8)), ValueError, "visual is uint8.*divide"),
         (broken("tactile", lambda x: x * np.nan), ValueError, "tactile has NaN"),
-        (broken("pose", lambda x: x * 2), ValueError, "quaternion of length 2"),
-        (broken("pose", lambda x: x + np.eye(7, dtype=np.float32)[0] * 40), ValueError, "give metres"),
         (broken("pose", lambda x: np.where(np.arange(7) == 4, 1e30, x)), ValueError, r"quaternion of length 1e\+30"),
-        (
-            broken("pose", lambda x: np.where(np.arange(7) == 4, 1e300, x.astype(float))),
-            ValueError,
-            "pose has NaN or infinite",
-        ),
-        (broken("pose", lambda x: x[:, :6]), TypeCheckError, "pose"),
+        (broken("pose", lambda x: x + np.eye(7, dtype=np.float32)[0] * 40), ValueError, "give metres"),
         (broken("pose", lambda x: x[0]), TypeCheckError, "pose"),
-        ({"pose": np.array([0, 0, 0, 1, 0, 0, 0])}, ValueError, "pose is int"),
-        ({"visual": "first.png"}, TypeCheckError, "visual"),
         ({**GIVEN, "condition": np.zeros((2, 3))}, ValueError, r"condition has shape \(2, 3\), but .* needs None"),
-        ({**GIVEN, "present": {"pose": np.ones(3, bool)}}, ValueError, r"present\['pose'\] is bool of shape \(3,\)"),
         ({**GIVEN, "present": {"pose": np.ones(2)}}, ValueError, r"present\['pose'\] is float64"),
-        ({"pose": POSE, "present": {"sound": True}}, ValueError, r"one of the given inputs \['pose'\]"),
         ({**GIVEN, "num_samples": 3}, ValueError, "and a key if it is > 0"),
-        ({"pose": POSE, "key": jax.random.key(0), "num_samples": -1}, ValueError, "num_samples=-1"),
-        ({"pose": POSE, "key": 0, "num_samples": 1}, TypeCheckError, "key"),
         ({"pose": POSE, "key": jax.random.split(jax.random.key(0)), "num_samples": 1}, TypeCheckError, "key"),
     ],
 )
 @pytest.mark.parametrize("jit", [False, True])
 def test_each_invalid_input_is_named(predictor, given, error, message, jit):
+    """Inside `jax.jit`, for constants."""
     with pytest.raises(error, match=message):
         jax.jit(lambda: predictor(**given))() if jit else predictor(**given)
-
-
-def test_shapes_types_and_constants_are_checked_inside_jit(predictor):
-    bright = jnp.asarray(GIVEN["visual"] * 255)
-    with pytest.raises(ValueError, match="divide by 255"):
-        jax.jit(lambda: predictor(visual=bright))()
-    for wrong, error, message in (
-        ({"visual": GIVEN["visual"][:, 1:]}, ValueError, "visual has shape"),
-        ({"visual": jnp.zeros((2, SIDE, SIDE, 3), jnp.uint8)}, ValueError, "visual is uint8"),
-        ({**GIVEN, "pose": POSE}, TypeCheckError, "pose"),
-        ({**GIVEN, "present": {"pose": jnp.ones(2)}}, ValueError, "must be bool"),
-        ({**GIVEN, "num_samples": jnp.int32(2)}, TypeCheckError, "num_samples"),
-    ):
-        with pytest.raises(error, match=message):
-            jax.jit(lambda given: predictor(**given))(wrong)
 
 
 @pytest.mark.slow
@@ -186,7 +151,6 @@ def test_an_input_that_was_absent_in_training_is_refused(tmp_path):
 def test_a_condition_is_given_in_si_units(tmp_path):
     scale = np.array([10.0, 10.0, 0.1])
     predictor = sts.Predictor.load(train(tmp_path / "mvae", condition_scale=tuple(scale.tolist())))
-    assert predictor.preprocessing.condition_scale == (10.0, 10.0, 0.1)
     given, condition = measurement(2), np.array([[4.0, -9.0, 0.07], [-4.0, 9.0, 0.12]])
     out = predictor(visual=given["visual"], condition=condition)
     logits, _ = mvae.predict(
@@ -200,20 +164,10 @@ def test_a_condition_is_given_in_si_units(tmp_path):
     assert np.abs(other.visual - out.visual).max() > 1e-3
     nothing = predictor.prior((2,), condition=condition)
     assert np.abs(nothing.pose[0] - nothing.pose[1]).max() > 1e-3
-    samples = predictor(visual=given["visual"], condition=condition, key=jax.random.key(0), num_samples=2).samples
-    assert samples.visual.shape == (2, 2, SIDE, SIDE, 3)
-    for wrong, message in (
-        (None, r"condition has shape None, but .* needs \(2, 3\)"),
-        (condition[:, :2], r"condition has shape \(2, 2\), but .* needs \(2, 3\)"),
-        (condition * np.nan, "finite numbers in SI units"),
-        (condition * 1e3, "SI units"),
-    ):
+    for wrong, message in ((None, r"condition has shape None, but .* needs \(2, 3\)"), (condition * 1e3, "SI units")):
         with pytest.raises(ValueError, match=message):
             predictor(visual=given["visual"], condition=wrong)
-    with pytest.raises(ValueError, match="condition has shape None"):
-        predictor.prior()
     traced = jax.jit(lambda condition: predictor(visual=given["visual"], condition=condition))
-    np.testing.assert_allclose(traced(condition).visual, out.visual, atol=1e-5)
     assert np.isnan(traced(condition * np.array([[1], [1e3]])).pose).all(-1).tolist() == [False, True]
 
 
@@ -225,20 +179,19 @@ def test_a_checkpoint_of_another_view_is_refused(folder):
         sts.Predictor.load(folder, resolution=(64, 64))
 
 
-def test_a_model_without_preprocessing_is_named(folder, tmp_path, monkeypatch):
+def test_a_model_without_preprocessing_is_named(folder, monkeypatch):
     model = training.load(folder)
-    for wrong in ({}, {"view": "pad"}, {**model.settings["preprocessing"], "resolution": 3}):
-        settings = {**model.settings, "preprocessing": wrong}
-        monkeypatch.setattr(training, "load", lambda _, settings=settings: model._replace(settings=settings))
-        with pytest.raises(ValueError, match=r"config\.json is not valid: .* training\.train\(.*, preprocessing="):
-            sts.Predictor.load(folder)
+    settings = {**model.settings, "preprocessing": {}}
+    monkeypatch.setattr(training, "load", lambda _: model._replace(settings=settings))
+    with pytest.raises(ValueError, match=r"config\.json is not valid: .* training\.train\(.*, preprocessing="):
+        sts.Predictor.load(folder)
 
 
 def test_a_saved_predictor_is_loaded_unchanged(predictor, tmp_path):
     predictor.save(tmp_path / "copy")
     again = sts.Predictor.load(tmp_path / "copy")
     given = measurement(2)
-    jax.tree.map(np.testing.assert_array_equal, again(**given), predictor(**given))
+    close(again(**given), predictor(**given), atol=0)
     assert repr(again) == repr(predictor).replace(predictor.name, str(tmp_path / "copy"))
     again.save(tmp_path / "second")
     for path in (tmp_path / "copy").glob("*.*"):
@@ -282,9 +235,7 @@ def test_the_gradient_of_a_prediction_equals_finite_differences(predictor):
         ("visual", lambda x: x.at[0, 3, 4, 0].set(jnp.nan)),
         ("tactile", lambda x: x.at[0].set(jnp.nan)),  # no pixel differs from the blank gel by a comparison with NaN
         ("visual", lambda x: x.at[0].multiply(255)),
-        ("pose", lambda x: x.at[0, 3:].multiply(2)),
         ("pose", lambda x: x.at[0, 3:].set(0)),
-        ("pose", lambda x: x.at[0, 3].set(1e30)),
         ("pose", lambda x: x.at[0, 0].set(40)),
         ("pose", lambda x: x.at[0, 2].set(jnp.inf)),
     ],
@@ -301,10 +252,10 @@ def test_only_an_invalid_traced_item_gives_nan(predictor, name, change):
         predictor(**wrong)
 
 
-@pytest.mark.parametrize("dtype", [jnp.bfloat16, jnp.float16, np.float64])
-def test_floats_of_any_precision_are_accepted(predictor, dtype):
+def test_floats_of_any_precision_are_accepted(predictor):
     pose = np.array([0, 0, 0.5, 1, 0, 0, 0], np.float32)
-    close(predictor(pose=pose.astype(dtype)), predictor(pose=pose))
+    for dtype in (jnp.bfloat16, np.float64):
+        close(predictor(pose=pose.astype(dtype)), predictor(pose=pose))
 
 
 @pytest.fixture(scope="module")
@@ -325,8 +276,6 @@ def test_a_state_space_model_predicts_samples_and_outcomes(state_predictor):
     out = state_predictor(**given, condition=CONDITION, present=present, **SAMPLES)
     assert out.visual.shape == out.tactile.shape == (2, 16, 16, 3)
     assert out.samples.visual.shape == out.samples.tactile.shape == (256, 2, 16, 16, 3)
-    assert out.samples.pose.shape == (256, 2, 7)
-    assert out.mean.shape == out.log_var.shape == (2, statespace.STATE_CODE + STATE.look)
     np.testing.assert_allclose(out.outcome_probability.sum(-1), 1, rtol=1e-5)
     assert out.outcome_probability.shape == (2, STATE.outcomes)
     np.testing.assert_allclose(out.tactile, out.samples.tactile.mean(0), atol=1e-6)
@@ -373,27 +322,18 @@ def test_a_state_space_model_works_in_jit_vmap_and_grad(state_predictor):
 
 
 @pytest.mark.slow
-def test_a_true_state_determines_the_belief_and_a_wrong_one_is_refused(state_predictor, predictor):
+def test_a_true_state_determines_the_belief_and_the_prior_is_standard_normal(state_predictor, predictor):
     given, code = measurement(2), np.asarray(random_states(np.random.default_rng(0), 2))
     out = state_predictor(visual=given["visual"], condition=CONDITION, state=code)
     np.testing.assert_allclose(out.mean[:, : statespace.STATE_CODE], code, atol=2e-3)
-    for wrong, error, message in (
-        (code[:1], TypeCheckError, "state"),
-        (code[:, :9], ValueError, r"state has shape \(2, 9\)"),
-        (code * np.nan, ValueError, "state has NaN"),
-    ):
-        with pytest.raises(error, match=message):
-            state_predictor(visual=given["visual"], condition=CONDITION, state=wrong)
+    with pytest.raises(ValueError, match=r"state has shape \(2, 9\)"):
+        state_predictor(visual=given["visual"], condition=CONDITION, state=code[:, :9])
     with pytest.raises(ValueError, match="does not accept state"):
         predictor(pose=given["pose"], state=code)
-
-
-@pytest.mark.slow
-def test_the_prior_of_a_state_space_model_is_standard_normal(state_predictor):
-    out = state_predictor.prior((2,), condition=CONDITION)
-    np.testing.assert_array_equal(out.mean, 0)
-    np.testing.assert_array_equal(out.log_var, 0)
-    assert np.abs(out.outcome_probability[0] - out.outcome_probability[1]).max() > 1e-4  # the condition differs
+    nothing = state_predictor.prior((2,), condition=CONDITION)
+    np.testing.assert_array_equal(nothing.mean, 0)
+    np.testing.assert_array_equal(nothing.log_var, 0)
+    assert np.abs(nothing.outcome_probability[0] - nothing.outcome_probability[1]).max() > 1e-4
 
 
 @pytest.mark.parametrize(
@@ -405,13 +345,6 @@ def test_a_state_space_model_of_another_view_is_refused(tmp_path, change):
         sts.Predictor.load(tmp_path / "model")
 
 
-@pytest.fixture(scope="module")
-def compact(state_predictor, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("compact") / "falls"
-    state_predictor.save(folder, compact=True)
-    return folder
-
-
 @pytest.mark.parametrize("kind", ["predictor", "state_predictor"])
 def test_a_compact_copy_predicts_nearly_the_same(kind, request, tmp_path):
     original = request.getfixturevalue(kind)
@@ -419,13 +352,6 @@ def test_a_compact_copy_predicts_nearly_the_same(kind, request, tmp_path):
     again = sts.Predictor.load(tmp_path / "copy")
     assert (again.preprocessing, again.model.config) == (original.preprocessing, original.model.config)
     assert (again.model.step, again.model.graphdef) == (original.model.step, original.model.graphdef)
-
-    def check(rounded, exact):
-        assert (rounded.shape, rounded.dtype) == (exact.shape, exact.dtype)
-        size = np.sqrt(np.mean(np.square(exact), axis=tuple(range(exact.ndim - 1)))) if exact.ndim > 1 else 0.0
-        assert np.all(np.abs(rounded - exact) <= 1.001 * size / 256)
-
-    jax.tree.map(check, again.model.state, original.model.state)
     more = {"condition": CONDITION} if original.model.config.condition else {}
     given = measurement(2)
     out, want = again(**given, **more), original(**given, **more)
@@ -433,15 +359,15 @@ def test_a_compact_copy_predicts_nearly_the_same(kind, request, tmp_path):
         np.testing.assert_allclose(getattr(out, name), getattr(want, name), atol=5e-3)
 
 
-def test_a_model_of_the_library_is_loaded_by_its_name(compact, predictor, tmp_path, monkeypatch):
-    monkeypatch.setattr("sts_jax.predict.MODELS", compact.parent)
+def test_a_model_of_the_library_is_loaded_by_its_name(state_predictor, predictor, tmp_path, monkeypatch):
+    monkeypatch.setattr("sts_jax.predict.MODELS", tmp_path / "library")
+    state_predictor.save(tmp_path / "library/falls")
     monkeypatch.chdir(tmp_path)
     assert repr(sts.Predictor.load("falls")).startswith("Predictor('falls': takes visual, tactile, pose; ")
     (tmp_path / "falls").mkdir()  # no model is in it
     assert sts.Predictor.load(pathlib.Path("falls")).model.config == STATE
-    for unknown in ("freefal", ".."):
-        with pytest.raises(FileNotFoundError, match=rf"'{unknown}' is neither .* come with sts_jax \(falls\)"):
-            sts.Predictor.load(unknown)
+    with pytest.raises(FileNotFoundError, match=r"'freefal' is neither .* come with sts_jax \(falls\)"):
+        sts.Predictor.load("freefal")
     with pytest.raises(FileNotFoundError, match=r"falls has no config\.json"):
         sts.Predictor.load(tmp_path / "falls")
     predictor.save("falls")

@@ -60,19 +60,6 @@ def folder(saved, tmp_path):
     return shutil.copytree(saved, tmp_path / "model")
 
 
-@pytest.fixture(scope="module")
-def fitted(saved, tmp_path_factory):
-    path = shutil.copytree(saved, tmp_path_factory.mktemp("fitted") / "model")
-    training.calibrate(path, arrays())
-    return path
-
-
-@pytest.fixture
-def calibrated(fitted, tmp_path):
-    """A model that was calibrated on `arrays()`."""
-    return shutil.copytree(fitted, tmp_path / "calibrated")
-
-
 def test_corrections_are_powers_and_a_factor():
     final = density(np.random.default_rng(0), 5, components=2)
     found = predict.corrected(final, jnp.float32(0.5), jnp.float32(2.0), jnp.float32(3.0))
@@ -192,34 +179,20 @@ def test_fitted_contrast_has_the_gradient_energy_of_the_true_images():
 
 
 @pytest.mark.slow
-def test_same_trajectories_are_not_fitted_again(calibrated, monkeypatch):
-    written = (calibrated / "calibration.json").read_bytes()
-    monkeypatch.setattr(statespace, "fit_calibration", None)  # a call would fail
-    training.calibrate(calibrated, arrays())
-    assert (calibrated / "calibration.json").read_bytes() == written
-    with pytest.raises(TypeError):
-        training.calibrate(calibrated, arrays(condition=np.ones((NUMBER, 3), np.float32)))
-
-
-@pytest.mark.slow
-def test_calibration_of_another_model_is_not_used(calibrated, tmp_path):
-    state_model(mask_blank_touch=False).save(tmp_path / "other")
-    shutil.copy(calibrated / "calibration.json", tmp_path / "other")
-    assert training.load(calibrated).calibration is not None
-    assert training.load(tmp_path / "other").calibration is None
-
-
-@pytest.mark.slow
-def test_damaged_calibration_is_named_and_fitted_again(calibrated):
-    path = calibrated / "calibration.json"
+def test_a_calibration_is_fitted_again_only_if_it_is_damaged_or_the_data_differ(folder, monkeypatch):
+    path = folder / "calibration.json"
+    training.calibrate(folder, arrays())
     whole = path.read_text()
-    for damaged in (whole[:-30], whole.replace('"variance": ', '"variance": 1', 1), None):
+    for damaged in (whole.replace('"variance": ', '"variance": 1', 1), None):
         path.unlink() if damaged is None else path.write_text(damaged)
         with pytest.raises(storage.DamagedFileError, match=r"calibration\.json.*calibrate again"):
-            training.load(calibrated)
-    training.calibrate(calibrated, arrays())
+            training.load(folder)
+    training.calibrate(folder, arrays())
     assert path.read_text() == whole
-    assert training.load(calibrated).calibration is not None
+    monkeypatch.setattr(statespace, "fit_calibration", None)  # a call would fail
+    training.calibrate(folder, arrays())
+    with pytest.raises(TypeError):
+        training.calibrate(folder, arrays(condition=np.ones((NUMBER, 3), np.float32)))
 
 
 @pytest.mark.parametrize("moment", [1, 2])

@@ -2,7 +2,6 @@
 
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from scipy import special
 from scipy.spatial.transform import Rotation
 
@@ -38,14 +37,6 @@ def unit(angle):
 def test_basis_equals_scipy():
     places = np.concatenate([directions(200), np.eye(3, dtype=np.float32), -np.eye(3, dtype=np.float32)])
     np.testing.assert_allclose(harmonics.basis(jnp.asarray(places), DEGREE), expected_basis(places), atol=2e-5)
-
-
-@pytest.mark.parametrize("degree", [0, 1, 3])
-def test_harmonic_is_homogeneous_in_its_degree(degree):
-    places = directions(20)
-    power = np.repeat(np.arange(degree + 1), 2 * np.arange(degree + 1) + 1)
-    whole, half = (np.asarray(harmonics.basis(jnp.asarray(scale * places), degree)) for scale in (1, 0.5))
-    np.testing.assert_allclose(half, whole * 0.5**power, atol=1e-6)
 
 
 def test_values_of_turned_functions_are_those_in_directions_turned_back():

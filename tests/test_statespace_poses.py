@@ -1,6 +1,5 @@
 """Pose codes turned about the vertical, compared with quaternions and a dense covariance."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -65,12 +64,3 @@ def test_heading_is_that_of_the_first_level_axis(rotation, expected):
     matrix = geometry.quat_to_matrix(geometry.quat_from_rotvec(jnp.array(rotation)))
     code = jnp.concatenate([jnp.zeros(3), matrix.reshape(9)])
     np.testing.assert_allclose(poses.heading(code), expected, atol=1e-6)
-
-
-def test_turned_variance_is_the_diagonal_of_the_turned_covariance():
-    rng = np.random.default_rng(0)
-    variance = rng.uniform(0.1, 2, 12).astype(np.float32)
-    angle = unit(0.7)
-    matrix = jax.vmap(lambda code: poses.turn_code(angle, code))(jnp.eye(12)).T  # turning is linear
-    covariance = np.asarray(matrix) @ np.diag(variance) @ np.asarray(matrix).T
-    np.testing.assert_allclose(poses.turn_variance(angle, jnp.asarray(variance)), np.diag(covariance), rtol=1e-5)

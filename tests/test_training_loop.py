@@ -83,21 +83,6 @@ def test_a_state_keeps_its_structure_and_dtypes():
         assert (a.shape, a.dtype, a.weak_type) == (b.shape, b.dtype, getattr(b, "weak_type", False))
 
 
-def test_beta_warms_up_over_its_share_of_the_steps():
-    graphdef, state = training.initial(CONFIG, training.learner(SMALL), 100)
-    batch = arrays().take(np.arange(8))
-    subsets = 2 + np.mean(batch["present"]["b"])  # {a}, {a, b}, and {b} where it is present
-
-    @jax.jit
-    def parts(state, batch):
-        return training.step(training.learner(SMALL), graphdef, CONFIG, 100, state, batch)[1]
-
-    for step, beta in ((0, 0.0), (10, 0.4), (25, 1.0), (90, 1.0)):
-        terms = parts(state._replace(step=jnp.int32(step)), batch)
-        rest = sum(subsets * terms[name] for name in SMALL.names)
-        np.testing.assert_allclose(terms["loss"], rest + beta * subsets * terms["kl"], rtol=1e-4)
-
-
 def test_a_loss_that_is_not_finite_ends_the_run(tmp_path):
     config = training.TrainConfig(steps=40, batch_size=8, log_every=1, checkpoint_every=1, learning_rate=1e30)
     with pytest.raises(FloatingPointError, match="learning_rate"):

@@ -76,9 +76,8 @@ def save(folder: Path, state: TrainState, *, compact: bool = False) -> None:
     """Write a checkpoint, then delete older checkpoints. If it fails, the previous checkpoint stays the current one.
 
     Args:
-        compact: True writes all arrays to one small file with rounded weights. A weight w is stored as a 16-bit integer
-            q, with `w = q s`. Each output channel of a kernel has its own step `s = max(rms / 128, largest / 32767)`.
-            Vectors, such as biases, are unchanged.
+        compact: True writes one small file, in which a weight w is a 16-bit integer q, with `w = q s`. Each output
+            channel of a kernel has its own step `s = max(rms / 128, largest / 32767)`. Vectors are unchanged.
     """
     before = manifest(folder)
     if before is None:
