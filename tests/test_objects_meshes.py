@@ -76,7 +76,7 @@ def test_parts_that_share_an_edge_are_closed(tmp_path):
     assert len(both.vertices) == 14
     assert not both.is_watertight  # four faces at the common edge, whole: no diagonal
     both.export(tmp_path / "boxes.ply")
-    body = objects.load(tmp_path / "boxes.ply")
+    body = objects.load(tmp_path / "boxes.ply", strict=True)
     assert not body.two_sided
     assert volume(body) == pytest.approx(2 * 0.03 * 0.02 * 0.04, rel=1e-5)
 
@@ -84,6 +84,8 @@ def test_parts_that_share_an_edge_are_closed(tmp_path):
     for name, faces in (("open", whole[1:]), ("turned", np.vstack([whole[:1, ::-1], whole[1:]]))):
         path = tmp_path / f"{name}.ply"
         trimesh.Trimesh(both.vertices, faces, process=False).export(path)
+        with pytest.raises(ValueError, match="is not closed"):
+            objects.load(path, strict=True)
         with pytest.warns(UserWarning, match="is not closed"):
             assert objects.load(path).two_sided
 
@@ -116,6 +118,8 @@ def test_missing_materials_and_images_are_named_and_texture_replaces_them(tmp_pa
     with pytest.warns(UserWarning, match=r"flag\.mtl.*argument texture") as caught:
         objects.load(path)
     assert len(caught) == 1
+    with pytest.raises(FileNotFoundError, match=r"flag\.mtl"):
+        objects.load(path, strict=True)
     body = objects.load(path, texture=tmp_path / "flag.png")
     assert body.texture.shape == (256, 256, 3)
     assert looked_up(body)[surface(body).triangles[..., 2] > 0][:, 0].min() > 0.5

@@ -29,14 +29,19 @@ def references(path: Path, images: Path | None = None) -> dict[str, Path | None]
     return files
 
 
-def check_materials(path: Path, images: Path | None) -> None:
-    """Check the materials and images of an OBJ, because trimesh silently ignores missing and damaged ones."""
+def check_materials(path: Path, images: Path | None, strict: bool) -> None:
+    """Check the materials and images of an OBJ, because trimesh silently ignores missing and damaged ones.
+
+    A missing file is a warning, or an error if `strict`.
+    """
     if path.suffix.lower() != ".obj":
         return
     files = references(path, images)
     missing = ", ".join(str(path.parent / name) for name, file in files.items() if file is None)
     if missing:
         problem = f"{path}: the mesh refers to missing files: {missing}. Add them, or give an image (argument texture)"
+        if strict:
+            raise FileNotFoundError(problem)
         warnings.warn(problem, stacklevel=3)
     for file in files.values():
         if file is not None and file.suffix.lower() != ".mtl":

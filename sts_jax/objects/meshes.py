@@ -55,6 +55,7 @@ def load(
     mass: float | None = None,
     density: float = WALL,
     hollow: bool = True,
+    strict: bool = False,
     up: Literal["x", "y", "z"] | tuple[float, float, float] = "z",
     front: tuple[float, float, float] | None = None,
     texture: str | os.PathLike[str] | None = None,
@@ -86,6 +87,8 @@ def load(
         density: Mass of the shell per area (kg/m^2), if `mass` is None.
         hollow: If True and `mass` is None, the body can hold contents of 1,000 kg/m^3. The filled share is an argument
             of `rigid`. The convex hull bounds the contents of a mesh that is not closed, with a warning.
+        strict: If True, a mesh that is not closed or encloses no volume is an error, and so is a missing material or
+            image of an OBJ file.
         up: Axis of the file, or direction in the file, that becomes +z. The convention of glTF files is "y".
         front: Direction in the file that becomes -y, by default (0, -1, 0). Must be None if `up` is an axis.
         texture: Image file that replaces the file's own textures. It needs texture coordinates in the mesh.
@@ -111,7 +114,7 @@ def load(
         check_file(path)
         images = None if textures is None else Path(textures)
         if texture is None:
-            check_materials(path, images)
+            check_materials(path, images, strict)
         pieces = _read(path, images)
         corners = checked_corners(pieces, faces) @ turn.T
         if texture is not None:
@@ -119,7 +122,7 @@ def load(
         surface = merge(corners * _factor(path, corners, longest_side, scale, largest), *albedo(path, pieces))
         if faces is not None and max(len(surface.faces), len(surface.vertices)) > faces:
             surface = decimate(path, surface, faces)
-        body = _body(path, surface, mass, density, hollow, category)
+        body = _body(path, surface, mass, density, hollow, strict, category)
         return decompose(body) if parts else body
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
@@ -188,7 +191,9 @@ def _factor(
     return factor
 
 
-def _body(path: Path, surface: Surface, mass: float | None, density: float, hollow: bool, category: int) -> Body:
+def _body(
+    path: Path, surface: Surface, mass: float | None, density: float, hollow: bool, strict: bool, category: int
+) -> Body:
     """Make a body of a surface. If the surface encloses no volume, its convex hull bounds the contents."""
     vertices, faces, colors, uv, texture = surface
     if max(len(faces), len(vertices)) > FACE_CLASSES[-1]:
@@ -207,8 +212,10 @@ def _body(path: Path, surface: Surface, mass: float | None, density: float, holl
     interior = (vertices, faces)
     holds = hollow and mass is None
     if not (closed and abs(mesh.volume) > 1e-6 * hull.volume):
+        fault = "encloses no volume" if closed else "is not closed"
+        if strict:
+            raise ValueError(f"the mesh {fault}: repair it, or give strict=False, and its hull bounds the contents")
         if holds:
-            fault = "encloses no volume" if closed else "is not closed"
             warnings.warn(
                 f"{path}: the mesh {fault}, so its convex hull ({hull.volume * 1e6:.3g} ml) is used as the space that "
                 "the contents can fill",
