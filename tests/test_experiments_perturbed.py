@@ -132,9 +132,9 @@ def test_pictures_for_recognition_come_with_their_answers(workdir, tmp_path, mon
     assert {text.splitlines()[1] for text in found} == {"answers: A1 B2", "answers: A2 B1"}
     with Image.open(tmp_path / "0.png") as picture:
         assert picture.size[0] > 100
-    with pytest.raises(ValueError, match=r"at least 2 trajectories from index 100 \(--first\) on, got 0"):
+    with pytest.raises(ValueError, match="--first must leave at least 2 held-out trajectories, got 100"):
         recognise.main(recognise.Args(workdir, tmp_path / "no.png", first=100))
-    with pytest.raises(ValueError, match="--first must be at least 0, got -1"):
+    with pytest.raises(ValueError, match="--first must leave at least 2 held-out trajectories, got -1"):
         recognise.main(recognise.Args(workdir, tmp_path / "no.png", first=-1))
 
 
