@@ -13,11 +13,11 @@ ROOMS = [
     for name, paths, lines, budget in re.findall(r"^\| ([^|`]+) \| (`[^|]+) \| ([\d,]+) \| ([\d,]+) \|$", PAGE, re.M)
 ]
 TOTALS = {
-    "library without hardware": 17_500,
-    "hardware": 4_800,
-    "experiments": 3_000,
-    "benchmarks": 4_500,
-    "tests": 16_000,
+    "library without hardware": 17_710,
+    "hardware": 5_600,
+    "experiments": 4_700,
+    "benchmarks": 4_850,
+    "tests": 18_100,
 }
 
 
