@@ -13,7 +13,7 @@ ROOMS = [
     for name, paths, lines, budget in re.findall(r"^\| ([^|`]+) \| (`[^|]+) \| ([\d,]+) \| ([\d,]+) \|$", PAGE, re.M)
 ]
 TOTALS = {
-    "library without hardware": 17_710,
+    "library without hardware": 17_720,
     "hardware": 5_600,
     "experiments": 4_700,
     "benchmarks": 4_850,

@@ -115,7 +115,9 @@ def place(
         yaw: Rotation about the sensor's z axis (rad). At 0, the +z axis of a lying body points to the top of the image.
             If the body stands upright or upside down, its -y axis points there instead.
         position: x and y of the centre of the body's bounding box (m).
-        fill, shell_scale, up: Those of `stable_faces`.
+        fill: As in `stable_faces`.
+        shell_scale: As in `stable_faces`.
+        up: As in `stable_faces`.
     """
     _check_body(body)
     if not isinstance(sensor, Sensor):
