@@ -91,3 +91,10 @@ def test_images_of_another_resolution_and_invalid_fields_are_refused():
         training.Preprocessing(touch_block=3)
     with pytest.raises(ValueError, match="resolution is missing"):
         training.Preprocessing.from_json({})
+
+
+def test_an_unknown_rotation_or_modality_is_named():
+    with pytest.raises((ValueError, TypeCheckError), match="rotation"):  # tests check all annotations first
+        training.Preprocessing(rotation="euler")
+    with pytest.raises(ValueError, match="modalities must be some of visual, tactile, pose, got 'visal'"):
+        training.paper_model(("visal",), training.Preprocessing())

@@ -214,6 +214,8 @@ def paper_model(
         mvae.Modality(m.name, "image" if m.is_image else "vector", m.shape, weight=float(m.weight))
         for m in measurements
     ]
+    if unknown := set(modalities) - set(standard):
+        raise ValueError(f"modalities must be some of {', '.join(standard)}, got {unknown.pop()!r}")
     chosen = [standard[name] for name in modalities]
     return mvae.Config((*chosen, *further), condition=len(preprocessing.condition_scale))
 

@@ -41,6 +41,8 @@ class Preprocessing:
     scales: tuple[tuple[str, float], ...] = ()
 
     def __post_init__(self) -> None:
+        if self.rotation not in ("matrix", "quaternion"):
+            raise ValueError(f"rotation must be 'matrix' or 'quaternion', got {self.rotation!r}")
         if self.touch_block < 1 or any(side % self.touch_block for side in self.resolution):
             raise ValueError(f"touch_block must divide resolution {self.resolution}, got {self.touch_block}")
 
