@@ -1,7 +1,7 @@
 """Measure how much hidden properties change the outcome of a trajectory, and how well touch and images reveal them.
 
     python -m benchmarks.hidden                 # the jerked pad, about half an hour on two CPU cores
-    python -m benchmarks.hidden outcomes truth  # two of the four parts, which are listed below
+    python -m benchmarks.hidden outcomes truth  # two of the three parts, which are listed below
     python -m benchmarks.hidden outcomes truth --scenario inclined --soaked FOLDER  # load stored trajectories
 
 - `outcomes`: the share of each outcome, and the share of the starts whose outcome changes with other contents.
@@ -9,9 +9,6 @@
   the first are the exact shape, the first pose and the jerk (on the slope, with the noise `slope_features.SEEN`). The
   second also gets a noisy measurement of touch: the weight on the jerked pad, the centre of pressure on the slope.
 - `pictures`: as `truth`, but a small network estimates the measurement of touch from the first uint8 tactile image.
-- `fill`: the AUCs of networks that separate objects that are more than half full from emptier ones, from tactile images
-  of standing objects, from visual images in the air, and from the same with a tint on the fuller objects, which shows
-  that such a network detects a visible difference. For the jerked pad only.
 
 Cross-validation folds and bootstrap samples (for 95 % intervals) contain all starts of an object or none.
 """
@@ -20,20 +17,18 @@ import dataclasses
 import functools
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, get_args
 
 import jax
 import numpy as np
 import tyro
-from jaxtyping import PRNGKeyArray
 
 from benchmarks.instruments import classifier, cnn, jerk_features, slope_features
 from benchmarks.instruments.starts import Starts, bodies, draw, roll, soaked
 from sts_jax import objects, physics
 from sts_jax.evaluation import metrics
 
-Part = Literal["outcomes", "truth", "pictures", "fill"]
-TINT = 0.1  # share of white in the colours of painted objects (linear light)
+Part = Literal["outcomes", "truth", "pictures"]
 OTHERS = 1_000_000  # number of the first object on which networks are trained, far beyond the numbers under study
 EXAMPLES = 8  # starts of each object on which networks are trained
 
@@ -42,7 +37,6 @@ EXAMPLES = 8  # starts of each object on which networks are trained
 class Study:
     """The settings with which the benchmark studies one scenario, such as the classes of the objects."""
 
-    parts: tuple[Part, ...]  # parts that exist for the scenario
     scenario: physics.Scenario
     categories: tuple[str, ...]  # classes of the objects, in turn
     reroll: tuple[str, ...]  # fields of `physics.Hidden` that are drawn again
@@ -53,18 +47,8 @@ class Study:
     features: Callable[[Any, list[objects.Body], Starts, np.ndarray | None], np.ndarray]
 
 
-class Lesson(NamedTuple):
-    """Training data of networks, and the images to which the networks are applied."""
-
-    items: list[objects.Body]  # training objects
-    starts: Starts  # EXAMPLES starts of each training object
-    examples: np.ndarray  # uint8 (m, 64, 64, 3), tactile frames of these starts
-    tactile: np.ndarray  # uint8 (n, 64, 64, 3), tactile frames of the starts under study
-
-
 STUDIES = {
     "perturbed": Study(
-        parts=("outcomes", "truth", "pictures", "fill"),
         scenario=physics.Perturbed(),
         categories=("bottle",),
         reroll=("fill",),
@@ -74,7 +58,6 @@ STUDIES = {
         features=jerk_features.shaken,
     ),
     "inclined": Study(
-        parts=("outcomes", "truth", "pictures"),  # `fill` compares containers that stand
         scenario=physics.Inclined(),
         categories=objects.CATEGORIES,
         reroll=("fill", "up"),
@@ -90,7 +73,7 @@ STUDIES = {
 class Args:
     """Options of the command line."""
 
-    parts: tyro.conf.Positional[tuple[Part, ...]] = ()  # parts of the printed report (default: all for the scenario)
+    parts: tyro.conf.Positional[tuple[Part, ...]] = ()  # parts of the printed report (default: all)
     scenario: Literal["perturbed", "inclined"] = "perturbed"  # the jerked pad, or the slope
     objects: int | None = None  # number of simulated objects (default: 200)
     num: int = 16  # number of simulated starts of each object
@@ -100,8 +83,6 @@ class Args:
     soaked: Path | None = None  # folder of kept blocks of `benchmarks.soak`, used instead of simulated starts
 
     def __post_init__(self) -> None:
-        if unknown := set(self.parts) - set(STUDIES[self.scenario].parts):
-            raise ValueError(f"--scenario {self.scenario} has no part {', '.join(sorted(unknown))}")
         if self.soaked is not None and (self.objects, self.again) != (None, None):
             raise ValueError("--soaked provides the trajectories: leave out --objects and --again")
 
@@ -147,49 +128,14 @@ def gains(study: Study, items: list[objects.Body], starts: Starts, read: np.ndar
     print(f"{'share of the gain kept':30s} {interval(classifier.kept, before, after, with_read)}", flush=True)
 
 
-def lesson(study: Study, items: list[objects.Body], starts: Starts, others: int) -> Lesson:
-    """Render tactile images of training objects and of the objects under study."""
+def pictures(study: Study, items: list[objects.Body], starts: Starts, others: int, steps: int) -> np.ndarray:
+    """Train a network on tactile images of other objects, and return its estimates of the measurement of touch."""
     rest = bodies(study.categories, others, OTHERS)
     learned = roll(jax.random.key(1), rest, dataclasses.replace(study.scenario, frames=1), EXAMPLES)
-    return Lesson(rest, learned, draw(rest, learned)[1], draw(items, starts)[1])
-
-
-def pictures(study: Study, learned: Lesson, starts: Starts, steps: int) -> np.ndarray:
-    """Train a network on tactile images, and return its estimates of the mass or of the centre of pressure."""
-    touch = study.touch(learned.starts)
+    touch = study.touch(learned)
     known = np.isfinite(touch).all(1)
-    read = cnn.fit(jax.random.key(0), learned.examples[known], touch[known], steps=steps)(learned.tactile)
+    read = cnn.fit(jax.random.key(0), draw(rest, learned)[known], touch[known], steps=steps)(draw(items, starts))
     return np.where(np.isfinite(study.touch(starts)), read, np.nan)  # the network need not detect missing contact
-
-
-def painted(body: objects.Body) -> objects.Body:
-    """Mix white into the colours of a body. The share of white in the new colours is TINT."""
-    return dataclasses.replace(body, colors=(1 - TINT) * body.colors + TINT)
-
-
-def aloft(key: PRNGKeyArray, items: list[objects.Body], num: int) -> tuple[Starts, np.ndarray, np.ndarray]:
-    """Render objects in the air at the start of a fall."""
-    starts = roll(key, items, physics.Freefall(frames=11), num)  # 11 frames are the minimum of the scenario
-    plain, _ = draw(items, starts)
-    both, _ = draw([painted(body) for body in items], starts)
-    return starts, plain, np.where((starts.fill > 0.5)[:, None, None, None], both, plain)
-
-
-def detect(name: str, images: np.ndarray, starts: Starts, new: np.ndarray, held_out: Starts, steps: int) -> None:
-    """Train a network to detect whether the object in an image is more than half full, and print its AUC."""
-    read = cnn.fit(jax.random.key(1), images, starts.fill[:, None] > 0.5, steps=steps)
-    label, score = held_out.fill > 0.5, read(new)[:, 0]
-    figure = classifier.interval(metrics.auc, label, score, groups=held_out.body)
-    print(f"{'AUC of the fill: ' + name:30s} {figure} ({len(label)} held-out items)", flush=True)
-
-
-def fill(learned: Lesson, items: list[objects.Body], starts: Starts, num: int, steps: int) -> None:
-    """Print the AUCs of three networks that detect whether an object is more than half full."""
-    detect("touch, standing", learned.examples, learned.starts, learned.tactile, starts, steps)
-    flying, plain, tinted = aloft(jax.random.key(2), learned.items, EXAMPLES)
-    new, new_plain, new_tinted = aloft(jax.random.key(3), items, num)
-    detect("seen in the air", plain, flying, new_plain, new, steps)
-    detect(f"{TINT:.0%} tint", tinted, flying, new_tinted, new, steps)
 
 
 def begun(study: Study, args: Args) -> tuple[list[objects.Body], Starts]:
@@ -205,19 +151,16 @@ def begun(study: Study, args: Args) -> tuple[list[objects.Body], Starts]:
 def main(args: Args) -> None:
     """Load or simulate the starts (initial states of trajectories), and print the requested parts of the report."""
     study = STUDIES[args.scenario]
-    parts = set(args.parts or study.parts)
+    parts = args.parts or get_args(Part)
     items, starts = begun(study, args)
     number = len(np.unique(starts.body))
     print(study.scenario)
     print(f"{len(starts.body)} starts of {number} objects ({', '.join(study.categories)})", flush=True)
     if "outcomes" in parts:
         outcomes(study, starts)
-    learned = lesson(study, items, starts, args.others) if parts & {"pictures", "fill"} else None
-    read = pictures(study, learned, starts, args.steps) if learned and "pictures" in parts else None
-    if parts & {"truth", "pictures"}:
+    read = pictures(study, items, starts, args.others, args.steps) if "pictures" in parts else None
+    if read is not None or "truth" in parts:
         gains(study, items, starts, read)
-    if learned and "fill" in parts:
-        fill(learned, items, starts, args.num, args.steps)
 
 
 if __name__ == "__main__":

@@ -57,7 +57,6 @@ PERTURBED = Path(sts_jax.__file__).parent / "models" / "perturbed"
         (lambda: gap.main(gap.Args(trajectories=9)), "--trajectories must be >= 10, got 9"),
         (lambda: gap.main(gap.Args(resolution=(64, 64))), "must have the aspect ratio"),
         (lambda: hidden.Args(soaked=Path("a"), objects=200), "--soaked provides the trajectories"),
-        (lambda: hidden.Args(parts=("fill",), scenario="inclined"), "--scenario inclined has no part fill"),
         (lambda: shipped.main(shipped.Args("perturbed", objects=4)), "--objects must be at least 5, got 4"),
         (lambda: shipped.main(shipped.Args("freefall", trained=PERTURBED)), "perturbed has outcomes=4 and condition=3"),
     ],

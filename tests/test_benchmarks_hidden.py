@@ -47,7 +47,7 @@ def test_interval_has_the_width_of_the_variation_between_objects():
     assert figure.high - figure.low == pytest.approx(2 * 1.96 * values.std() / 10, rel=0.1)
 
 
-def test_network_predicts_the_strength_and_the_presence_of_a_faint_blob():
+def test_network_predicts_the_strength_of_a_faint_blob():
     rng = np.random.default_rng(3)
     size = rng.uniform(0, 1, 400)
     images = np.full((400, 32, 32, 3), 150.0) + rng.normal(scale=2, size=(400, 32, 32, 3))
@@ -56,8 +56,6 @@ def test_network_predicts_the_strength_and_the_presence_of_a_faint_blob():
     images = images.round().astype(np.uint8)
     strength = cnn.fit(jax.random.key(0), images[:300], size[:400, None], steps=80)
     assert np.std(strength(images[300:])[:, 0] - size[300:]) < 0.1
-    presence = cnn.fit(jax.random.key(0), images[:300], size[:400, None] > 0.5, steps=80)
-    assert metrics.auc(size[300:] > 0.5, presence(images[300:])[:, 0]) > 0.95
 
 
 def test_features_are_invariant_under_the_symmetries_of_the_pad():

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 import sts_jax as sts
-from benchmarks import deterministic, recognise, scaling
+from benchmarks import deterministic, scaling
 from benchmarks.instruments.experiments import EXPERIMENTS
 from experiments import perturbed, show
 from experiments.shared import run
@@ -124,18 +124,6 @@ def test_show_writes_a_strip_and_an_animation(name, scenario, tmp_path, monkeypa
 def test_an_unknown_scenario_cannot_be_shown(tmp_path):
     with pytest.raises(ValueError, match="must be one of freefall, inclined, perturbed"):
         show.main(show.Config("sideways", out=tmp_path))
-
-
-def test_pictures_for_recognition_come_with_their_answers(workdir, tmp_path, monkeypatch):
-    monkeypatch.setattr(recognise, "NUMBER", 2)
-    found = [recognise.main(recognise.Args(workdir, tmp_path / f"{seed}.png", seed=seed)) for seed in range(6)]
-    assert {text.splitlines()[1] for text in found} == {"answers: A1 B2", "answers: A2 B1"}
-    with Image.open(tmp_path / "0.png") as picture:
-        assert picture.size[0] > 100
-    with pytest.raises(ValueError, match="--first must leave at least 2 held-out trajectories, got 100"):
-        recognise.main(recognise.Args(workdir, tmp_path / "no.png", first=100))
-    with pytest.raises(ValueError, match="--first must leave at least 2 held-out trajectories, got -1"):
-        recognise.main(recognise.Args(workdir, tmp_path / "no.png", first=-1))
 
 
 @pytest.fixture

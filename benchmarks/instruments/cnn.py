@@ -48,8 +48,7 @@ def fit(
     key: PRNGKeyArray, images: np.ndarray, targets: np.ndarray, *, steps: int
 ) -> Callable[[np.ndarray], np.ndarray]:
     """Train a network to predict `targets` from `images`."""
-    logits = targets.dtype == bool
-    centre, scale = (0.0, 1.0) if logits else (targets.mean(0), targets.std(0))
+    centre, scale = targets.mean(0), targets.std(0)
     wanted = jnp.asarray((targets - centre) / scale, jnp.float32)
     mean = images.mean((0,), dtype=np.float64).astype(np.float32)
     spread = float(np.mean([np.square(image - mean).mean() for image in images]) ** 0.5)
@@ -58,9 +57,7 @@ def fit(
         return apply(weights, (rows.astype(jnp.float32) - mean) / spread)
 
     def loss(weights: Weights, rows: Array, target: Array) -> Array:
-        found = outputs(weights, rows)
-        each = optax.sigmoid_binary_cross_entropy(found, target) if logits else jnp.square(found - target)
-        return each.mean()
+        return jnp.square(outputs(weights, rows) - target).mean()
 
     optimizer = optax.adam(optax.cosine_decay_schedule(RATE, steps))
     begin, order = jax.random.split(key)

@@ -104,19 +104,18 @@ def roll(
     )
 
 
-def draw(items: list[objects.Body], starts: Starts) -> tuple[np.ndarray, np.ndarray]:
-    """Render the first frame of each trajectory."""
+def draw(items: list[objects.Body], starts: Starts) -> np.ndarray:
+    """Render the first tactile image of each trajectory."""
 
-    def one(index: int) -> tuple[np.ndarray, ...]:
+    def one(index: int) -> np.ndarray:
         own = starts.body == index
         images = dataset.render_uint8(
             Sensor(), items[index], starts.pose[own], starts.wrench[own], resolution=(64, 64), crop=False
         )
-        return tuple(np.asarray(image) for image in images[:2])
+        return np.asarray(images[1])
 
     with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
-        visual, tactile = zip(*pool.map(one, np.unique(starts.body).tolist()), strict=True)
-    return np.concatenate(visual), np.concatenate(tactile)
+        return np.concatenate([*pool.map(one, np.unique(starts.body).tolist())])
 
 
 def claim(folder: Path, name: str, size: int) -> None:
