@@ -39,7 +39,6 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from tqdm import tqdm
 
 from sts_jax import geometry, objects, physics
-from sts_jax.dataset.symmetry import turn, turn_condition
 from sts_jax.physics import scene
 from sts_jax.physics.scenario import Shape, Start
 from sts_jax.sensor import Sensor
@@ -80,7 +79,12 @@ class MirroredPerturbed(physics.Perturbed):
 
 def mirror(start: Start) -> Start:
     """Mirror the start of a trajectory: y becomes -y in its pose and its condition (such as the pad's acceleration)."""
-    return start._replace(pose=turn(start.pose, 4), condition=turn_condition(start.condition, 4))
+    flip = jnp.array([1.0, -1, 1])
+    pose = start.pose * jnp.concatenate([flip, jnp.array([1.0, -1, 1, -1])])
+    quat = geometry.quat_canonical(pose[3:])
+    return start._replace(
+        pose=jnp.concatenate([pose[:3], quat]), condition=start.condition * flip[: len(start.condition)]
+    )
 
 
 def mirror_shape(shape: Shape) -> Shape:

@@ -24,7 +24,6 @@ COLLECTION = dataset.Collection(
     num_rendered=4,
     num_views=8,
     num_full=20,
-    symmetries=False,
     resolution=(128, 128),
     shares=(0.9, 0.04, 0.06),
     seed=2,

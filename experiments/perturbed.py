@@ -26,7 +26,6 @@ COLLECTION = dataset.Collection(
     num_per_object=6,
     num_rendered=4,
     num_full=20,
-    symmetries=False,
     resolution=(128, 128),
     shares=(0.9, 0.04, 0.06),
     seed=2,

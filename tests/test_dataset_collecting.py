@@ -13,7 +13,6 @@ import pytest
 
 import sts_jax as sts
 from sts_jax import dataset, evaluation, storage
-from sts_jax.dataset.symmetry import turn_wrench
 
 SMALL = dataset.Collection(
     sts.physics.Freefall(frames=12), num_objects=4, num_per_object=2, num_full=1, objects_per_shard=2
@@ -40,19 +39,19 @@ def sparse(tmp_path_factory):
 def test_stored_frames_are_those_that_sense_draws(folder):
     data = dataset.load(folder)
     assert data.trajectory["pose"].shape == (8, 12, 7)
-    pairs = data.pairs(np.array([5, 0]), symmetries=True)
-    assert pairs.visual.shape == (16, 2, 64, 64, 3)
-    body = dataset.make_bodies(SMALL, np.array([2]))[0]
+    pairs = data.pairs(np.array([5, 0]))
+    assert pairs.visual.shape == (2, 2, 64, 64, 3)
     sense = jax.jit(lambda body, pose, wrench: sts.sense(sts.Sensor(), body, pose, wrench))
-    for symmetry in range(8):
-        pose = pairs.pose[symmetry, 1]
-        wrench = turn_wrench(jnp.asarray(data.trajectory["wrench"][5, -1]), symmetry)
-        frame = sense(sts.objects.mirror(body) if symmetry >= 4 else body, jnp.asarray(pose), wrench)
-        for stored, drawn in ((pairs.visual, frame.visual), (pairs.tactile, frame.tactile)):
-            difference = np.abs(stored[symmetry, 1].astype(int) - np.round(np.asarray(drawn) * 255))
-            assert np.mean(difference > 1) < 0.01
-    np.testing.assert_array_equal(pairs.trajectory, [5] * 8 + [0] * 8)
-    np.testing.assert_array_equal(pairs.object, data.trajectory["body"][pairs.trajectory])
+    for row, (number, trajectory) in enumerate(((2, 5), (0, 0))):
+        (body,) = dataset.make_bodies(SMALL, np.array([number]))
+        for place in (0, -1):
+            pose, wrench = (jnp.asarray(data.trajectory[name][trajectory, place]) for name in ("pose", "wrench"))
+            frame = sense(body, pose, wrench)
+            for stored, drawn in ((pairs.visual, frame.visual), (pairs.tactile, frame.tactile)):
+                difference = np.abs(stored[row, place].astype(int) - np.round(np.asarray(drawn) * 255))
+                assert np.mean(difference > 1) < 0.01
+    np.testing.assert_array_equal(pairs.trajectory, [5, 0])
+    np.testing.assert_array_equal(pairs.object, [2, 0])
 
 
 def test_trajectories_do_not_depend_on_the_number_of_rendered_ones(folder, sparse):
@@ -60,7 +59,7 @@ def test_trajectories_do_not_depend_on_the_number_of_rendered_ones(folder, spars
     for name in ("pose", "outcome", "wrench", "body"):
         np.testing.assert_array_equal(data.trajectory[name], whole.trajectory[name])
     np.testing.assert_array_equal(data.rendered(), [0, 2, 4, 6])
-    for one, frames in ((data, 12 + 3 * 2 + 4 * 14), (whole, 12 + 7 * 2 + 8 * 14)):  # others have two frames
+    for one, frames in ((data, 12 + 3 * 2), (whole, 12 + 7 * 2)):  # others have two frames
         np.testing.assert_array_equal(one.full_trajectories(), [0])
         assert one.strip(0).visual.shape == (12, 64, 64, 3)
         assert len(one.frames) == frames
@@ -84,19 +83,17 @@ def test_trajectories_do_not_depend_on_the_number_of_rendered_ones(folder, spars
 
 def test_the_true_shape_and_mass_are_those_of_the_body_with_its_hidden_values(folder):
     data = dataset.load(folder)
-    pairs, ends = data.pairs(np.arange(8), symmetries=True), data.ends(np.arange(8))
+    pairs, ends = data.pairs(np.arange(8)), data.ends(np.arange(8))
     bodies, rigid = dataset.make_bodies(SMALL, np.arange(4)), jax.jit(sts.objects.rigid)
-    for row, (number, trajectory) in enumerate(zip(pairs.object, pairs.trajectory, strict=True)):
-        made = sts.objects.mirror(bodies[number]) if row % 8 >= 4 else bodies[number]
-        hidden = {name: leaf[trajectory] for name, leaf in data.hidden.items()}
-        up = hidden["up"] * (np.array([1, -1, 1], np.float32) if row % 8 >= 4 else 1)
-        mass, com, _ = rigid(made, hidden["fill"], hidden["shell_scale"], up)
-        np.testing.assert_array_equal(pairs.support[row], sts.objects.support(made))
+    for row, number in enumerate(pairs.object):
+        hidden = {name: leaf[row] for name, leaf in data.hidden.items()}
+        mass, com, _ = rigid(bodies[number], hidden["fill"], hidden["shell_scale"], hidden["up"])
+        np.testing.assert_array_equal(pairs.support[row], sts.objects.support(bodies[number]))
         np.testing.assert_allclose(pairs.mass[row], mass, rtol=1e-5)
         np.testing.assert_allclose(pairs.com[row], com, atol=1e-7)
-    np.testing.assert_allclose(ends.pose, pairs.pose[::8], atol=1e-6)
+    np.testing.assert_allclose(ends.pose, pairs.pose, atol=1e-6)
     for name in ("support", "mass", "com", "outcome", "object", "condition"):
-        np.testing.assert_array_equal(getattr(ends, name), getattr(pairs, name)[::8])
+        np.testing.assert_array_equal(getattr(ends, name), getattr(pairs, name))
     assert {leaf.dtype for leaf in (pairs.support, pairs.mass, pairs.com, pairs.pose)} == {np.dtype(np.float32)}
 
 
@@ -209,8 +206,8 @@ EDITED = r" is not the file that manifest\.json lists .*delete it \(of a shard b
         (edit("manifest.json", "facts", {"shards": 1}), r"manifest\.json is damaged"),
         (lambda at: (at / "manifest.json").unlink(), r"manifest\.json is missing, but .* has shards: restore it, or"),
         (rewrite("collection.json", lambda data: b"\xff"), r"collection\.json cannot be read as JSON"),
-        (of_format(4), r"is a dataset of format 4, .* reads format 5: collect into another"),
-        (of_format("x"), r"is a dataset of format 'x', .* reads format 5: collect into another"),
+        (of_format(4), r"is a dataset of format 4, .* reads format 6: collect into another"),
+        (of_format("x"), r"is a dataset of format 'x', .* reads format 6: collect into another"),
     ],
 )
 def test_damage_is_named_and_nothing_is_overwritten(copied, damage, message):

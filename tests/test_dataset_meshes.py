@@ -32,9 +32,7 @@ def folder(tmp_path):
 
 
 def collection(meshes: dataset.Meshes) -> dataset.Collection:
-    return dataset.Collection(
-        SCENARIO, meshes=meshes, num_objects=6, num_per_object=1, num_full=0, symmetries=False, objects_per_shard=3
-    )
+    return dataset.Collection(SCENARIO, meshes=meshes, num_objects=6, num_per_object=1, num_full=0, objects_per_shard=3)
 
 
 def test_usable_objects_and_others_are_listed(folder):

@@ -63,7 +63,7 @@ def test_presets_hold_out_enough_objects_and_that_of_the_paper_has_its_counts(ex
         assert set(dataset.class_names(one)) == set(classes)
     assert paper.num_per_object <= 10
     assert paper.num_trajectories == paper.num_full == trajectories
-    assert (paper.scenario.frames, paper.crop, paper.symmetries) == (60, True, False)
+    assert (paper.scenario.frames, paper.crop) == (60, True)
     schedule = experiment.PAPER.training
     assert (schedule.epochs, schedule.batch_size, schedule.beta_warmup) == (200, 64, 50 / 200)
     assert (experiment.PAPER.targets, experiment.PAPER.splits) == ("own", ("trajectory", "object"))
@@ -97,14 +97,14 @@ def test_any_field_of_a_preset_can_be_changed(monkeypatch, capsys):
         monkeypatch,
         *("--collection.num-objects", "1000", "--state-training.learning-rate", "1e-3", "--image-size", "32"),
         *("--collection.scenario.height", "0.07", "--collection.scenario.contact.soft", "0.1"),
-        *("--collection.symmetries", "--collection.num-rendered", "None", "--splits", "trajectory", "object"),
+        *("--collection.num-rendered", "None", "--splits", "trajectory", "object"),
         *("--preset", "smoke"),
     )
     smoke, scenario = freefall.SMOKE, freefall.SMOKE.collection.scenario
     scenario = dataclasses.replace(scenario, height=0.07, contact=dataclasses.replace(scenario.contact, soft=0.1))
     expected = changed(
         smoke,
-        {"num_objects": 1000, "scenario": scenario, "symmetries": True, "num_rendered": None},
+        {"num_objects": 1000, "scenario": scenario, "num_rendered": None},
         state_training=dataclasses.replace(smoke.state_training, learning_rate=1e-3),
         image_size=32,
         splits=("trajectory", "object"),

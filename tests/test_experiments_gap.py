@@ -103,9 +103,7 @@ def test_bad_options_are_refused(folder, tmp_path):
 
 @pytest.mark.slow
 def test_a_dataset_is_compared_without_a_match_at_its_own_resolution(folder, tmp_path, capsys):
-    collection = dataset.Collection(
-        physics.Released(frames=6), categories=("camera",), num_objects=5, num_per_object=1, symmetries=False
-    )
+    collection = dataset.Collection(physics.Released(frames=6), categories=("camera",), num_objects=5, num_per_object=1)
     dataset.collect(collection, sts.Sensor(), tmp_path / "made")
     options = command.Config(folder, tmp_path / "made", match="none", out=tmp_path / "out")
     real, simulated = command.load(options)

@@ -35,7 +35,7 @@ def test_the_code_of_the_page_trains_both_kinds_of_models_as_the_experiments_do(
     config = dataclasses.replace(freefall.DEFAULT, collection=names["collection"])
     data = names["data"]
     falls = data.ends(data.members("train", rendered=False))
-    pairs = data.pairs(data.members("train"), symmetries=True)
+    pairs = data.pairs(data.members("train"))
     (job,) = run.jobs(config, names["sensor"], pairs, data.views("train"), falls)
     assert job.model == names["model"]
     assert job.preprocessing == names["preprocessing"]

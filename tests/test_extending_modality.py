@@ -12,7 +12,6 @@ from extending_page import DOCS, blocks
 
 import sts_jax as sts
 from sts_jax import dataset, evaluation, training
-from sts_jax.dataset.symmetry import turn_wrench
 
 NOTHING = np.full((32, 32, 3), 178, np.uint8)  # image of the empty sensor
 
@@ -21,11 +20,7 @@ def wrenches(data, trajectories):
     return data.trajectory["wrench"][trajectories][:, [0, -1]]
 
 
-def turned(values, symmetry):
-    return np.asarray(turn_wrench(jnp.asarray(values), symmetry))
-
-
-WRENCH = dataset.Measurement("wrench", (6,), wrenches, unit="N", turn=turned)
+WRENCH = dataset.Measurement("wrench", (6,), wrenches, unit="N")
 
 
 @pytest.fixture(scope="module")
@@ -39,18 +34,12 @@ def data(tmp_path_factory):
     return dataset.load(folder)
 
 
-def test_pairs_have_the_measured_values_and_their_copies_turn(data):
+def test_pairs_have_the_measured_values(data):
     rows = np.array([4, 1])
-    plain = data.pairs(rows, measurements=(WRENCH,))
-    np.testing.assert_array_equal(plain.measurements["wrench"], data.trajectory["wrench"][[4, 1]][:, [0, -1]])
-    assert np.abs(plain.measurements["wrench"]).max() > 0.1
-    copies = data.pairs(rows, symmetries=True, measurements=(WRENCH,))
-    assert len(copies.pose) == 16
-    for row, (trajectory, symmetry) in enumerate((t, s) for t in rows for s in range(8)):
-        assert copies.trajectory[row] == trajectory
-        expected = turned(data.trajectory["wrench"][trajectory][[0, -1]], symmetry)
-        np.testing.assert_allclose(copies.measurements["wrench"][row], expected, atol=1e-6)
-    assert len(copies.take(slice(3)).measurements["wrench"]) == 3
+    pairs = data.pairs(rows, measurements=(WRENCH,))
+    np.testing.assert_array_equal(pairs.measurements["wrench"], data.trajectory["wrench"][[4, 1]][:, [0, -1]])
+    assert np.abs(pairs.measurements["wrench"]).max() > 0.1
+    assert len(pairs.take(slice(1)).measurements["wrench"]) == 1
     assert data.pairs(rows).measurements == {}
 
 
@@ -67,13 +56,11 @@ def test_pairs_have_the_measured_values_and_their_copies_turn(data):
         ({"shape": (4, 4)}, r"shape is \(4, 4\)"),
         ({"scale": 0.0}, "scale is 0.0, but it must be > 0"),
         ({"shape": (32, 32, 3), "scale": 2.0}, "an image needs no scale"),
-        ({"turn": None}, "'wrench' has no function `turn`, which symmetries=True needs"),
-        ({"turn": lambda values, symmetry: values[:, :1]}, r"`turn` returned an array of shape \(2, 1, 6\)"),
     ],
 )
 def test_a_wrong_measurement_of_a_dataset_is_named(data, changes, message):
     with pytest.raises(ValueError, match=message):
-        data.pairs(np.array([0, 1]), symmetries=True, measurements=(dataclasses.replace(WRENCH, **changes),))
+        data.pairs(np.array([0, 1]), measurements=(dataclasses.replace(WRENCH, **changes),))
 
 
 # ---- Training and prediction. Load 2 follows from load 1, so that the truth is known. The images show nothing.

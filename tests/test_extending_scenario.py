@@ -14,7 +14,7 @@ from extending_page import blocks
 import sts_jax as sts
 from experiments import perturbed
 from experiments.shared import run
-from sts_jax import dataset, physics
+from sts_jax import physics
 
 ENGINES = ["mujoco", pytest.param("mjx", marks=pytest.mark.slow)]
 FRICTION = 0.4
@@ -127,19 +127,6 @@ def test_mistakes_in_a_scenario_are_named(page, changes, match):
     wrong = dataclasses.dataclass(frozen=True)(type("Wrong", (page["Rolled"],), changes))
     with pytest.raises(ValueError, match=match):
         physics.simulate(jax.random.key(0), page["bottle"], sts.Sensor(), wrong())
-
-
-@pytest.mark.parametrize(("name", "vectors"), [("Rolled", 1), ("Tilting", 0)])
-def test_a_dataset_turns_the_vectors_of_a_condition_and_keeps_its_numbers(page, tmp_path, name, vectors):
-    scenario = page[name](frames=2)
-    collection = dataset.Collection(scenario, ("bottle",), num_objects=2, num_per_object=1, num_full=0)
-    dataset.collect(collection, sts.Sensor(), tmp_path)
-    data = dataset.load(tmp_path)
-    pairs, condition = data.pairs(np.array([0]), symmetries=True), data.trajectory["condition"][0]
-    for copy, symmetry in zip(pairs.condition, scenario.symmetries, strict=True):
-        mirror = np.diag([1.0, -1.0 if symmetry >= 4 else 1.0])
-        quarter = np.linalg.matrix_power(np.array([[0.0, -1.0], [1.0, 0.0]]), symmetry % 4)
-        np.testing.assert_allclose(copy, quarter @ mirror @ condition if vectors else condition, atol=1e-6)
 
 
 @pytest.mark.slow

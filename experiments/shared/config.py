@@ -186,7 +186,6 @@ def smoke(default: Config) -> Config:
             num_rendered=None,
             num_full=4,
             objects_per_shard=8,
-            symmetries=False,
             shares=(0.7, 0.1, 0.2),
             seed=0,
         ),
@@ -210,7 +209,6 @@ def paper(collection: dataset.Collection, *, num_objects: int, num_per_object: i
             num_full=num_objects * num_per_object,  # all trajectories, with about 60 frames each
             num_rendered=None,
             num_views=0,
-            symmetries=False,
             resolution=(64, 64),
             crop=True,
             shares=(0.7, 0.1, 0.2),
@@ -229,7 +227,7 @@ def paper(collection: dataset.Collection, *, num_objects: int, num_per_object: i
 def check(config: Config, own: Extensions = NONE) -> None:
     """Find a mistake in the configuration before the dataset is collected."""
     collection, names = config.collection, tuple(MODELS["paper"])
-    collection.check(sts.Sensor())
+    collection.check()
     height, width = collection.resolution
     if height != width:
         raise ValueError(f"collection.resolution must be square, got {height} x {width}: give {height} {height}")

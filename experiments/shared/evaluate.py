@@ -142,7 +142,7 @@ def _check_measurements(folder: Path, own: Extensions) -> None:
 
 def _pairs(run: Run, data: dataset.Dataset, own: Extensions) -> SplitPairs:
     rows, size, further = evaluation.rows_of(data, run.split), run.config.image_size, own.measurements
-    train = dataset.reduced(data.pairs(rows["train"], symmetries=True, measurements=further), size)
+    train = dataset.reduced(data.pairs(rows["train"], measurements=further), size)
     validation, given = (data.pairs(rows[part], measurements=further) for part in ("validation", "test"))
     test = dataset.reduced(given, size)
     if run.config.model == "paper":

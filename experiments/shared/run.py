@@ -284,7 +284,7 @@ def train(run: Run, data: dataset.Dataset, own: Extensions = NONE) -> None:
     for job in jobs(
         config,
         run.sensor,
-        data.pairs(rows["train"], symmetries=True, measurements=own.measurements),
+        data.pairs(rows["train"], measurements=own.measurements),
         data.views("train") if state else None,
         data.ends(data.members("train", rendered=False)) if state else None,
         own.measurements,

@@ -3,26 +3,17 @@
 A shard is a pure function of the `Collection`, the sensor and its index, so a missing shard can be made again.
 """
 
-import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from sts_jax import objects, physics
 from sts_jax.dataset import records
-from sts_jax.dataset.collection import (
-    Collection,
-    as_json,
-    class_names,
-    make_bodies,
-    split_objects,
-    symmetries_of,
-)
+from sts_jax.dataset.collection import Collection, as_json, class_names, make_bodies, split_objects
 from sts_jax.dataset.rendering import render
 from sts_jax.sensor import Sensor
 from sts_jax.storage import checksums, claim, lock, read_arrays, verify, write_arrays, write_json, write_manifest
@@ -66,7 +57,7 @@ def collect(
         Summary of the whole dataset, including the shards that earlier calls made.
     """
     sensor.check()
-    collection.check(sensor)
+    collection.check()
     with lock(folder):
         return _collect(collection, sensor, folder, progress)
 
@@ -169,13 +160,8 @@ def _arrays(
     arrays = {f"trajectory/{name}": leaf for name, leaf in trajectory._asdict().items() if name != "hidden"}
     arrays |= {f"hidden/{name}": leaf for name, leaf in trajectory.hidden._asdict().items()}
     arrays["trajectory/body"] = members[arrays["trajectory/body"]].astype(np.int32)
-    which = np.asarray(trajectory.body)
-    solid = _solid(bodies, which, trajectory.hidden)
-    # The support function needs the mirrored hulls only. `objects.mirror` takes longer, because it mirrors all arrays.
-    flip = jnp.array([1.0, -1, 1])
-    flipped = [dataclasses.replace(body, hulls=body.hulls * flip) for body in bodies]
-    mirrored = np.stack([objects.support(body) for body in flipped])
-    arrays |= {f"solid/{name}": leaf for name, leaf in solid.items()} | {"solid/mirrored": mirrored[which]}
+    solid = _solid(bodies, np.asarray(trajectory.body), trajectory.hidden)
+    arrays |= {f"solid/{name}": leaf for name, leaf in solid.items()}
     arrays |= {f"view/{name}": leaf for name, leaf in views.items()}
     arrays["view/body"] = members[views["body"]].astype(np.int32)
     return arrays
@@ -199,9 +185,9 @@ def _named(collection: Collection, number: int) -> str:
 
 
 def _frames_of(collection: Collection, members: np.ndarray, trajectory: physics.Trajectory) -> np.ndarray:
-    """The frames to render, as rows (index of the trajectory in the shard, frame, symmetry), int `(m, 3)`."""
+    """The frames to render, as rows (index of the trajectory in the shard, frame), int `(m, 2)`, sorted by object."""
     num, last = trajectory.pose.shape[0], trajectory.pose.shape[1] - 1
-    rows: list[tuple[int, int, int]] = []
+    rows: list[tuple[int, int]] = []
     for i in range(num):
         # The trajectories that are rendered in full are spread over the objects: the first one of each object, then the
         # second one of each object, and so on.
@@ -209,12 +195,8 @@ def _frames_of(collection: Collection, members: np.ndarray, trajectory: physics.
         if repeat >= collection.rendered_per_object:
             continue
         rank = repeat * collection.num_objects + members[place]
-        full = rank < collection.num_full
-        rows += [(i, t, 0) for t in (range(last + 1) if full else (0, last))]
-        rows += [(i, t, symmetry) for symmetry in symmetries_of(collection) if symmetry for t in (0, last)]
-    frames = np.array(rows, np.int32)
-    # Sorted by object, mirrored copies last. One call renders one body, and the mirrored object is another body.
-    return frames[np.lexsort((frames[:, 2] >= 4, frames[:, 0] // collection.num_per_object))]
+        rows += [(i, t) for t in (range(last + 1) if rank < collection.num_full else (0, last))]
+    return np.array(rows, np.int32)
 
 
 def _solid(bodies: list[objects.Body], which: np.ndarray, hidden: physics.Hidden) -> dict[str, np.ndarray]:

@@ -9,7 +9,6 @@ import numpy as np
 from sts_jax import objects, physics
 from sts_jax.dataset import records
 from sts_jax.dataset.meshes import Meshes, open_library
-from sts_jax.sensor import Sensor
 
 PARTS = ("train", "validation", "test")  # the parts into which the objects are split
 
@@ -33,7 +32,6 @@ class Collection:
     num_full: int = 20  # number of trajectories with images of all frames (the others: of the first and last frame)
     num_rendered: int | None = None  # number of trajectories with images, for each object: the first ones (None: all)
     num_views: int = 0  # additional visual images per object, in initial poses that are not simulated
-    symmetries: bool = True  # also render turned and mirrored copies of first and last frames (`scenario.symmetries`)
     resolution: tuple[int, int] = (64, 64)  # height and width of the images (pixels)
     crop: bool = False  # images show the square around the object, as in the paper, instead of the whole pad
     shares: tuple[float, float, float] = (0.7, 0.1, 0.2)  # shares of objects for training, validation and test (sum 1)
@@ -56,13 +54,9 @@ class Collection:
         """Number of shards."""
         return math.ceil(self.num_objects / self.objects_per_shard)
 
-    def check(self, sensor: Sensor) -> None:
-        """Raise a ValueError if a field or the scenario is invalid, or if quarter turns need a square pad."""
+    def check(self) -> None:
+        """Raise a ValueError if a field or the scenario is invalid."""
         self.scenario.check()
-        sides = [float(side) for side in sensor.gel.size]
-        quarter_turns = any(symmetry % 2 for symmetry in symmetries_of(self))
-        if quarter_turns and sides[0] != sides[1]:
-            raise ValueError(f"symmetries=True needs a square pad, got gel.size={sides} m: set symmetries=False")
         if min(self.shares) < 0 or not math.isclose(sum(self.shares), 1):
             raise ValueError(f"shares={self.shares}, but shares must be >= 0 and have sum 1")
         if self.meshes is not None and self.num_objects != len(self.meshes.names):
@@ -134,17 +128,8 @@ def split_objects(collection: Collection) -> dict[str, np.ndarray]:
     return {name: np.sort(part).astype(np.int64) for name, part in zip(PARTS, np.split(order, cuts), strict=True)}
 
 
-def symmetries_of(collection: Collection) -> tuple[int, ...]:
-    """Return the numbers of the symmetries (see `dataset.symmetry`) in which first and last frames are rendered."""
-    return collection.scenario.symmetries if collection.symmetries else (0,)
-
-
 def as_json(collection: Collection) -> dict:
     """The content of a dataset's `collection.json`."""
     content = dataclasses.asdict(collection)
-    scenario = collection.scenario
-    content["scenario"] = {"name": type(scenario).__name__, **content["scenario"]}
-    # Omitted if it is 1, because the descriptions of older datasets do not have this field and must stay valid.
-    if scenario.quantities and scenario.vectors != 1:
-        content["scenario"]["vectors"] = scenario.vectors
+    content["scenario"] = {"name": type(collection.scenario).__name__, **content["scenario"]}
     return {"format": records.FORMAT, **content}

@@ -8,17 +8,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from sts_jax import geometry
 from sts_jax.dataset import records
 from sts_jax.dataset.measurement import Measurement, measured
-from sts_jax.dataset.symmetry import turn, turn_condition
 from sts_jax.storage import digest, read_arrays, read_json, verify
 
 
 class Pairs(NamedTuple):
-    """First and last frames of n trajectories and of their turned and mirrored copies.
+    """First and last frames of n trajectories.
 
     In arrays of shape `(n, 2, ...)`, index 0 of the second axis is the first frame and index 1 is the last frame.
     """
@@ -28,13 +27,13 @@ class Pairs(NamedTuple):
     segmentation: np.ndarray  # bool (n, 2, height, width): pixels that show the object
     pose: np.ndarray  # float32 (n, 2, 7): mesh frame in the sensor frame, position (m) and quaternion
     contact: np.ndarray  # bool (n, 2): true if the pad pushes on the object
-    condition: np.ndarray  # float32 (n, c): input of the scenario such as a jerk (SI units), transformed like the pose
+    condition: np.ndarray  # float32 (n, c): input of the scenario such as a jerk (SI units)
     outcome: np.ndarray  # int32 (n,): number of the outcome, one of `Scenario.outcomes`
     object: np.ndarray  # int32 (n,): index of the object in the collection
     trajectory: np.ndarray  # int64 (n,): index of the trajectory in the dataset
-    support: np.ndarray  # float32 (n, 128): support function of the body or of its mirror image (m), `objects.support`
+    support: np.ndarray  # float32 (n, 128): support function of the body (m), see `objects.support`
     mass: np.ndarray  # float32 (n,): mass of the object with its contents (kg)
-    com: np.ndarray  # float32 (n, 3): centre of mass in the mesh frame (m), mirrored like the body
+    com: np.ndarray  # float32 (n, 3): centre of mass in the mesh frame (m)
     # (n, 2, *shape) each: the values of further modalities by name, uint8 or float32, NaN where not measured
     measurements: dict[str, np.ndarray] = {}  # noqa: RUF012 (never changed)
 
@@ -116,11 +115,9 @@ class Dataset:
     split: dict[str, np.ndarray]  # indices of the objects in each part: `train`, `validation` and `test`
     trajectory: dict[str, np.ndarray]  # fields of `physics.Trajectory` by name, each (num, ...)
     hidden: dict[str, np.ndarray]  # fields of `physics.Hidden` by name, each (num, ...)
-    # `support`, `mass` and `com` of each trajectory as in `Pairs`, and `mirrored`, the support function of the mirrored
-    # body. Each is (num, ...).
-    solid: dict[str, np.ndarray]
+    solid: dict[str, np.ndarray]  # `support`, `mass` and `com` of each trajectory as in `Pairs`, each (num, ...)
     view: dict[str, np.ndarray]  # `pose`, `body`, `support`, `mass` and `com` of each of the k views, each (k, ...)
-    frames: np.ndarray  # int (m, 3): trajectory, frame and symmetry of each stored frame, in the order of the shards
+    frames: np.ndarray  # int (m, 2): trajectory and frame of each stored frame, in the order of the shards
     shards: tuple[Path, ...]  # file of the images of each shard
     shard_of: np.ndarray  # int (m,): index of the shard of each stored frame
     record_of: np.ndarray  # int (m,): index of the record of each stored frame in its shard
@@ -160,13 +157,12 @@ class Dataset:
 
     def full_trajectories(self) -> np.ndarray:
         """Indices of the trajectories that have images of every frame."""
-        plain = self.frames[self.frames[:, 2] == 0]
-        counts = np.bincount(plain[:, 0], minlength=len(self.trajectory["outcome"]))
+        counts = np.bincount(self.frames[:, 0], minlength=len(self.trajectory["outcome"]))
         return np.flatnonzero(counts == self.trajectory["pose"].shape[1])
 
     def strip(self, trajectory: int) -> records.Images:
         """Read all stored images of one trajectory, in the order of time. See `full_trajectories`."""
-        rows = np.flatnonzero((self.frames[:, 0] == trajectory) & (self.frames[:, 2] == 0))
+        rows = np.flatnonzero(self.frames[:, 0] == trajectory)
         return self.images(rows[np.argsort(self.frames[rows, 1])])
 
     def members(self, part: str, *, rendered: bool = True) -> np.ndarray:
@@ -229,51 +225,39 @@ class Dataset:
             )
         return trajectories.astype(np.int64)
 
-    def pairs(
-        self, trajectories: np.ndarray, *, symmetries: bool = False, measurements: Sequence[Measurement] = ()
-    ) -> Pairs:
+    def pairs(self, trajectories: np.ndarray, *, measurements: Sequence[Measurement] = ()) -> Pairs:
         """Read the first and last frames of trajectories that have images.
 
         Args:
             trajectories: Indices of the trajectories, int `(n,)`.
-            symmetries: True to add the stored turned and mirrored copies directly after each trajectory.
             measurements: Further modalities to measure.
         """
-        trajectories = self._checked(trajectories)
-        without = trajectories[~np.isin(trajectories, self.rendered())]
+        index = self._checked(trajectories)
+        without = index[~np.isin(index, self.rendered())]
         if without.size:
             raise ValueError(
                 f"`trajectories` contains {without[0]}, which has no images: use `ends`, or take indices from "
                 "`members` or `rendered`."
             )
         last = self.trajectory["pose"].shape[1] - 1
-        kinds = np.unique(self.frames[:, 2]).tolist() if symmetries else [0]
         row_of = {tuple(row): i for i, row in enumerate(self.frames.tolist())}
-        wanted = [(int(t), kind) for t in trajectories for kind in kinds]
-        rows = np.array([[row_of[t, 0, q], row_of[t, last, q]] for t, q in wanted], np.int64).reshape(-1, 2)
-        images = [leaf.reshape(-1, 2, *leaf.shape[1:]) for leaf in self.images(rows.ravel())]
-        index = np.array([t for t, _ in wanted], np.int64)
-        ends, input = jnp.asarray(self.trajectory["pose"][:, [0, last]]), jnp.asarray(self.trajectory["condition"])
-        turned = np.stack([np.asarray(turn(ends, kind)) for kind in kinds])
-        vectors = self.collection["scenario"].get("vectors", 1)
-        conditions = np.stack([np.asarray(turn_condition(input, kind, vectors)) for kind in kinds])
-        place = np.tile(np.arange(len(kinds)), len(trajectories))
-        mirrored = np.array(kinds)[place, None] >= 4
-        com = self.solid["com"][index]
+        rows = np.array([row_of[t, frame] for t in index.tolist() for frame in (0, last)], np.int64)
+        images = [leaf.reshape(-1, 2, *leaf.shape[1:]) for leaf in self.images(rows)]
+        ends = self.trajectory["pose"][index][:, [0, last]]
         return Pairs(
             visual=images[0],
             tactile=images[1],
             segmentation=images[2],
-            pose=turned[place, index].astype(np.float32),
+            pose=np.concatenate([ends[..., :3], geometry.quat_canonical(ends[..., 3:])], -1),
             contact=self.trajectory["contact"][:, [0, last]][index],
-            condition=conditions[place, index].astype(np.float32),
+            condition=self.trajectory["condition"][index],
             outcome=self.trajectory["outcome"][index],
             object=self.trajectory["body"][index],
             trajectory=index,
-            support=np.where(mirrored, self.solid["mirrored"][index], self.solid["support"][index]),
+            support=self.solid["support"][index],
             mass=self.solid["mass"][index],
-            com=np.where(mirrored, com * np.array([1, -1, 1], np.float32), com),
-            measurements=measured(measurements, self, trajectories, kinds),
+            com=self.solid["com"][index],
+            measurements=measured(measurements, self, index),
         )
 
 
@@ -311,7 +295,7 @@ def load(folder: str | Path) -> Dataset:
             group: {k.split("/")[1]: v for k, v in leaves.items() if k.startswith(f"{group}/")}
             for group in ("trajectory", "hidden", "solid", "view")
         },
-        frames=np.concatenate([p["frames"] + np.array([s, 0, 0]) for p, s in zip(parts, starts[:-1], strict=True)]),
+        frames=np.concatenate([p["frames"] + np.array([s, 0]) for p, s in zip(parts, starts[:-1], strict=True)]),
         shards=tuple(folder / images for images, _ in files),
         shard_of=np.repeat(np.arange(count), sizes),
         record_of=np.concatenate([np.arange(size) for size in sizes]),

@@ -22,9 +22,6 @@ class Measurement:
     unit: str = ""  # SI unit of the numbers, for tables
     scale: float = 1.0  # typical size of the numbers (SI units). The networks receive the numbers divided by this size
     weight: float = 1.0  # weight of the reconstruction error in the loss of `mvae` models
-    # Function that receives values `(n, 2, *shape)` and the number of a symmetry, 0 to 7 (see `dataset.symmetry`). It
-    # returns the values in the turned or mirrored trajectories. Only `Dataset.pairs(..., symmetries=True)` needs it.
-    turn: Callable[[np.ndarray, int], np.ndarray] | None = None
 
     def __post_init__(self) -> None:
         if not self.name.isidentifier() or self.name in NAMES:
@@ -53,49 +50,18 @@ class Measurement:
         return len(self.shape) == 3
 
 
-def measured(
-    measurements: Sequence[Measurement], data: Any, trajectories: np.ndarray, symmetries: Sequence[int]
-) -> dict[str, np.ndarray]:
-    """Measure the first and last frames of n trajectories of a `Dataset`, each in k symmetries of the pad.
-
-    Returns:
-        The values of each modality by name, uint8 or float32 `(n * k, 2, *shape)`. The k copies of a trajectory are
-        consecutive.
-    """
+def measured(measurements: Sequence[Measurement], data: Any, trajectories: np.ndarray) -> dict[str, np.ndarray]:
+    """Measure the first and last frames of n trajectories of a `Dataset`: uint8 or float32 `(n, 2, *shape)` by name."""
     names = [measurement.name for measurement in measurements]
     if len(set(names)) < len(names):
         raise ValueError(f"measurements has the names {names}, but each name may occur only once: rename one")
-    return {each.name: _measured(each, data, trajectories, symmetries) for each in measurements}
+    return {each.name: _checked(each, each.measure(data, trajectories), len(trajectories)) for each in measurements}
 
 
-def _measured(measurement: Measurement, data: Any, trajectories: np.ndarray, symmetries: Sequence[int]) -> np.ndarray:
-    """Measure one modality in all trajectories and copies."""
-    name, turn = measurement.name, measurement.turn
-    if turn is None and any(symmetries):
-        raise ValueError(
-            f"measurement {name!r} has no function `turn`, which symmetries=True needs: give one, or pass "
-            "symmetries=False"
-        )
-    values = _checked(measurement, "measure", measurement.measure(data, trajectories), len(trajectories))
-    copies = [values]
-    if turn is not None:
-        copies = [
-            values if number == 0 else _checked(measurement, "turn", turn(values.copy(), number), len(values))
-            for number in symmetries
-        ]
-    kinds = {str(copy.dtype) for copy in copies}
-    if len(kinds) > 1:
-        raise ValueError(
-            f"measurement {name!r}: the functions `measure` and `turn` returned values of the types "
-            f"{' and '.join(sorted(kinds))}, but the types must be equal: return uint8 or floats in both"
-        )
-    return np.stack(copies, axis=1).reshape(-1, *values.shape[1:])
-
-
-def _checked(measurement: Measurement, function: str, values: Any, count: int) -> np.ndarray:
-    """Check the result of a function of the measurement, and return it as uint8 or float32."""
+def _checked(measurement: Measurement, values: Any, count: int) -> np.ndarray:
+    """Check the result of `measure`, and return it as uint8 or float32."""
     values, wanted = np.asarray(values), (count, 2, *measurement.shape)
-    start = f"measurement {measurement.name!r}: the function `{function}` returned "
+    start = f"measurement {measurement.name!r}: the function `measure` returned "
     if values.shape != wanted:
         raise ValueError(f"{start}an array of shape {values.shape}, but it must have shape {wanted}")
     if measurement.is_image and values.dtype == np.uint8:

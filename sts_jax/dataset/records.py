@@ -17,7 +17,7 @@ from array_record.python.array_record_module import ArrayRecordReader, ArrayReco
 
 from sts_jax.storage import MANIFEST, DamagedFileError, Manifest, read_json, read_manifest, write_whole
 
-FORMAT = 5  # format of a dataset's files, incremented when older files can no longer be read
+FORMAT = 6  # format of a dataset's files, incremented when older files can no longer be read
 DESCRIPTIONS = ("collection.json", "sensor.json", "split.json")
 # One record per group, because a read decompresses the whole group.
 WRITER_OPTIONS = "group_size:1,zstd:3"

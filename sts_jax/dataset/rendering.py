@@ -11,10 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
-from sts_jax import objects, physics
+from sts_jax import geometry, objects, physics
 from sts_jax.dataset import records
-from sts_jax.dataset.collection import Collection, make_bodies, symmetries_of
-from sts_jax.dataset.symmetry import turn, turn_wrench
+from sts_jax.dataset.collection import Collection, make_bodies
 from sts_jax.frame import sense
 from sts_jax.sensor import Sensor
 
@@ -47,8 +46,7 @@ def render(
         sensor: The sensor.
         bodies: The objects of the shard.
         trajectory: Their trajectories as NumPy arrays. `trajectory.body` is an index into `bodies`.
-        frames: Trajectory, frame and symmetry of each image, int `(m, 3)`, sorted by object. The mirrored frames of an
-            object follow its other frames.
+        frames: Trajectory and frame of each image, int `(m, 2)`, sorted by object.
         views: `pose` `(v, 7)` and `body`, int `(v,)`, an index into `bodies`, sorted by object.
         report: Called after each batch with the number of finished frames and views.
 
@@ -56,24 +54,19 @@ def render(
         Batches in the order of storage: visual images, tactile images and segmentations, or visual images of views.
     """
     size = frames_per_call()
-    turned = {
-        q: [np.asarray(f(jnp.asarray(x), q)) for f, x in ((turn, trajectory.pose), (turn_wrench, trajectory.wrench))]
-        for q in symmetries_of(collection)
-    }
-    mirrored = [objects.mirror(body) for body in bodies] if max(turned) >= 4 else bodies
+    quat, wrench = geometry.quat_canonical(trajectory.pose[..., 3:]), trajectory.wrench
+    pose = np.concatenate([trajectory.pose[..., :3], quat], -1)
 
     def jobs() -> Iterator[_Job]:
-        owner = np.stack([trajectory.body[frames[:, 0]], frames[:, 2] >= 4], 1)
-        for body_index, flip in np.unique(owner, axis=0):
-            rows = frames[(owner == [body_index, flip]).all(1)]
+        owner = trajectory.body[frames[:, 0]]
+        for body_index in np.unique(owner):
+            rows = frames[owner == body_index]
             for part in np.split(rows, range(size, len(rows), size)):
-                pose = np.stack([turned[q][0][i, t] for i, t, q in part])
-                wrench = np.stack([turned[q][1][i, t] for i, t, q in part])
-                yield _Job((mirrored if flip else bodies)[body_index], pose, wrench, False)
+                yield _Job(bodies[body_index], pose[part[:, 0], part[:, 1]], wrench[part[:, 0], part[:, 1]], False)
         for body_index in np.unique(views["body"]):
             poses = views["pose"][views["body"] == body_index]
-            for pose in np.split(poses, range(size, len(poses), size)):
-                yield _Job(bodies[body_index], pose, np.zeros((len(pose), 6), np.float32), True)
+            for some in np.split(poses, range(size, len(poses), size)):
+                yield _Job(bodies[body_index], some, np.zeros((len(some), 6), np.float32), True)
 
     def work(job: _Job) -> tuple[np.ndarray, ...]:
         pose, wrench = (np.pad(x, ((0, size - len(x)), (0, 0)), "edge") for x in (job.pose, job.wrench))

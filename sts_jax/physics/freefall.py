@@ -22,7 +22,6 @@ class Freefall(Scenario):
     Source: the See-Through-your-Skin paper, section "Data Collection".
     """
 
-    symmetries = tuple(range(8))
     outcomes = (Outcome.RESTS, Outcome.FELL_OFF)
 
     height: float = 0.05  # height of the object's lowest point above the pad in frame 0 (m)

@@ -44,7 +44,6 @@ class Inclined(Scenario):
     Collection".
     """
 
-    symmetries = (0, 6)  # x -> -x
     outcomes = (Outcome.ROLLS, Outcome.SLIDES, Outcome.STICKS, Outcome.FELL_OFF)
 
     slope: float = math.radians(30)  # angle of the pad to the horizontal (rad)

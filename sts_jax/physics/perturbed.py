@@ -53,7 +53,6 @@ class Perturbed(Scenario):
     paper, section "Data Collection".
     """
 
-    symmetries = tuple(range(8))
     quantities = (Quantity("acceleration", "m/s²", 10.0, vector=True), Quantity("duration", "s", 0.1))
     outcomes = (Outcome.TOPPLES, Outcome.SLIDES, Outcome.STANDS, Outcome.FELL_OFF)
 

@@ -48,7 +48,6 @@ class Released(Scenario):
     "Real-World Dataset", where the object is a small camera.
     """
 
-    symmetries = tuple(range(8))
     outcomes = (Outcome.TOPPLES, Outcome.RETURNS, Outcome.FELL_OFF)
 
     # range of the held angle minus the angle at which an object with average contents balances (rad, at a negative

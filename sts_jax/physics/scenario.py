@@ -87,7 +87,7 @@ class Quantity(NamedTuple):
     name: str  # Name in texts and figures.
     unit: str  # Unit in texts and figures.
     scale: float  # Typical size, in SI units. Networks receive the quantity divided by this size.
-    vector: bool = False  # True for a vector, whose two numbers turn with the pad under its symmetries.
+    vector: bool = False  # True for a vector, which is two numbers, in the plane of the pad.
 
 
 class Scenario(abc.ABC):
@@ -108,8 +108,6 @@ class Scenario(abc.ABC):
     outcomes: ClassVar[tuple[enum.IntEnum, ...]]
     # quantities of the condition, vectors first
     quantities: ClassVar[tuple[Quantity, ...]] = ()
-    # symmetries of the square pad under which the scenario does not change, as numbers of `dataset.turn`
-    symmetries: ClassVar[tuple[int, ...]] = (0,)
     must_stand: ClassVar[bool] = False  # True if the scenario refuses objects that cannot stand with +z up
     by_contents: ClassVar[bool] = False  # True if `Shape.coms` must have centres of mass for random contents
 
