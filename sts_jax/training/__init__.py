@@ -9,9 +9,10 @@ from sts_jax.training.arrays import shifted as shifted
 from sts_jax.training.arrays import state_arrays as state_arrays
 from sts_jax.training.arrays import state_codes as state_codes
 from sts_jax.training.arrays import state_model as state_model
-from sts_jax.training.config import TrainConfig as TrainConfig
-from sts_jax.training.config import optimiser as optimiser
+from sts_jax.training.folder import Model as Model
 from sts_jax.training.folder import TrainState as TrainState
+from sts_jax.training.folder import calibrate as calibrate
+from sts_jax.training.folder import load as load
 from sts_jax.training.folder import load_blank as load_blank
 from sts_jax.training.folder import records as records
 from sts_jax.training.folder import restore as restore
@@ -20,12 +21,11 @@ from sts_jax.training.folder import save_blank as save_blank
 from sts_jax.training.folder import save_calibration as save_calibration
 from sts_jax.training.loop import Learner as Learner
 from sts_jax.training.loop import Loss as Loss
+from sts_jax.training.loop import TrainConfig as TrainConfig
 from sts_jax.training.loop import initial as initial
 from sts_jax.training.loop import learner as learner
+from sts_jax.training.loop import optimiser as optimiser
 from sts_jax.training.loop import step as step
 from sts_jax.training.loop import train as train
-from sts_jax.training.model import Model as Model
-from sts_jax.training.model import calibrate as calibrate
-from sts_jax.training.model import load as load
 from sts_jax.training.preprocess import Preprocessing as Preprocessing
 from sts_jax.training.preprocess import touch_of_noisy_images as touch_of_noisy_images
