@@ -41,9 +41,9 @@ def test_classes_follow_the_categories():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"num_rendered": 3}, r"num_rendered must be None or from 1 to num_per_object=2, got 3"),
-        ({"num_views": -1}, r"num_views must be a whole number of at least 0, got -1"),
-        ({"num_objects": 0}, r"num_objects must be a whole number of at least 1, got 0"),
+        ({"num_rendered": 3}, r"num_rendered must be <= num_per_object=2, got 3"),
+        ({"num_views": -1}, r"num_views must be >= 0, got -1"),
+        ({"num_objects": 0}, r"num_objects must be >= 1, got 0"),
         ({"resolution": (64, 0)}, r"resolution must be two whole numbers .* got \(64, 0\)"),
         ({"categories": ()}, r"categories is empty, but it must name at least one class"),
         ({"categories": ("bottle", "cup")}, r"category is 'cup', but it must be one of bottle, camera"),

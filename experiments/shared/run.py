@@ -114,7 +114,7 @@ def configure(args: Args) -> Config:
 
 def with_meshes(collection: dataset.Collection, folder: Path, args: Args) -> dataset.Collection:
     """Replace the objects of a collection by those of a folder, with about the same number of trajectories in total."""
-    classes = dataset.mesh_classes(folder)
+    classes = sts.objects.library(folder).classes
     taken = args.classes or tuple(name for name in classes if name in collection.categories) or classes
     others = ", ".join(name for name in classes if name not in taken)
     path = args.workdir / "objects.txt"

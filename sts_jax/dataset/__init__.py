@@ -16,7 +16,6 @@ from sts_jax.dataset.loading import reduced as reduced
 from sts_jax.dataset.loading import reduced_images as reduced_images
 from sts_jax.dataset.measurement import Measurement as Measurement
 from sts_jax.dataset.meshes import Meshes as Meshes
-from sts_jax.dataset.meshes import mesh_classes as mesh_classes
 from sts_jax.dataset.meshes import survey_meshes as survey_meshes
 from sts_jax.dataset.records import Images as Images
 from sts_jax.dataset.rendering import empty_frame as empty_frame

@@ -58,34 +58,27 @@ def collect(
     """
     sensor.check()
     collection.check()
-    with lock(folder):
-        return _collect(collection, sensor, folder, progress)
-
-
-def _collect(
-    collection: Collection, sensor: Sensor, folder: Path, progress: Callable[[Progress], None] | None
-) -> Collected:
-    """Do the work of `collect` in a folder that this process has locked."""
-    manifest = records.manifest_of(folder)
-    claim(folder / "collection.json", as_json(collection))
-    claim(folder / "sensor.json", sensor.constants())
-    if not (folder / "split.json").exists():
-        split = {name: [int(i) for i in part] for name, part in split_objects(collection).items()}
-        write_json(folder / "split.json", split)
-    if manifest is None:
-        facts = {"shards": collection.num_shards}
-        manifest = write_manifest(folder, checksums(folder, records.DESCRIPTIONS), facts)
-    verify(folder, manifest, records.remedy(folder), records.DESCRIPTIONS)
     resampled, left_out = 0, []
-    for index in range(collection.num_shards):
-        files = records.shard_files(index, collection.num_shards)
-        if not all(name in manifest.files for name in files) or not any((folder / name).exists() for name in files):
-            _make_shard(collection, sensor, folder, index, progress)
-            manifest = write_manifest(folder, manifest.files | checksums(folder, files), manifest.facts)
-        verify(folder, manifest, records.remedy(folder), files)
-        arrays = read_arrays(folder / files[1], records.remedy(folder))
-        resampled += int(arrays["trajectory/resampled"].sum())
-        left_out += arrays["left_out"].tolist()
+    with lock(folder):
+        manifest = records.manifest_of(folder)
+        claim(folder / "collection.json", as_json(collection))
+        claim(folder / "sensor.json", sensor.constants())
+        if not (folder / "split.json").exists():
+            split = {name: [int(i) for i in part] for name, part in split_objects(collection).items()}
+            write_json(folder / "split.json", split)
+        if manifest is None:
+            facts = {"shards": collection.num_shards}
+            manifest = write_manifest(folder, checksums(folder, records.DESCRIPTIONS), facts)
+        verify(folder, manifest, records.remedy(folder), records.DESCRIPTIONS)
+        for index in range(collection.num_shards):
+            files = records.shard_files(index, collection.num_shards)
+            if not all(name in manifest.files for name in files) or not any((folder / name).exists() for name in files):
+                _make_shard(collection, sensor, folder, index, progress)
+                manifest = write_manifest(folder, manifest.files | checksums(folder, files), manifest.facts)
+            verify(folder, manifest, records.remedy(folder), files)
+            arrays = read_arrays(folder / files[1], records.remedy(folder))
+            resampled += int(arrays["trajectory/resampled"].sum())
+            left_out += arrays["left_out"].tolist()
     return Collected(resampled, tuple(left_out))
 
 
@@ -126,12 +119,7 @@ def _simulated(
     bodies: dict[int, objects.Body],
     report: Callable[[int], None],
 ) -> tuple[dict[int, objects.Body], physics.Trajectory | None, list[str]]:
-    """Simulate some objects, and leave out those that cannot be simulated.
-
-    Returns:
-        The simulated objects by index, their trajectories (None if no object is left), and one line for each object
-        that was left out.
-    """
+    """Simulate objects. Return those that can be simulated, their trajectories, and a line for each of the others."""
     bodies = dict(bodies)
     failed: list[str] = []
     while bodies:

@@ -2,14 +2,18 @@
 
 import dataclasses
 import math
+from dataclasses import field
 
 import jax
 import numpy as np
 
 from sts_jax import objects, physics
+from sts_jax._ranges import COUNT, NOT_NEGATIVE
+from sts_jax._ranges import check as check_ranges
 from sts_jax.dataset import records
 from sts_jax.dataset.meshes import Meshes, open_library
 
+_NUMBER = NOT_NEGATIVE | {"whole": True}  # 0 or a larger whole number
 PARTS = ("train", "validation", "test")  # the parts into which the objects are split
 
 
@@ -20,23 +24,28 @@ class Collection:
     The description has the names of your own scenario and object classes, but not their code.
     """
 
-    scenario: physics.Scenario = dataclasses.field(default_factory=physics.Freefall)
+    scenario: physics.Scenario = field(default_factory=physics.Freefall)
     # procedural classes, one object of each in turn (`objects.find_family` describes the allowed names)
     categories: tuple[str, ...] = objects.CATEGORIES
     # objects from mesh files, listed by `survey_meshes`, instead of procedural ones (num_objects must be their number)
     meshes: Meshes | None = None
     # split an object into convex parts if its hull fits badly (needs the package coacd, about ten seconds per object)
     parts: bool = False
-    num_objects: int = 160  # number of objects
-    num_per_object: int = 4  # trajectories per object, each with newly drawn hidden values such as mass and friction
-    num_full: int = 20  # number of trajectories with images of all frames (the others: of the first and last frame)
-    num_rendered: int | None = None  # number of trajectories with images, for each object: the first ones (None: all)
-    num_views: int = 0  # additional visual images per object, in initial poses that are not simulated
+    num_objects: int = field(default=160, metadata=COUNT)  # number of objects
+    # trajectories per object, each with newly drawn hidden values such as mass and friction
+    num_per_object: int = field(default=4, metadata=COUNT)
+    # number of trajectories with images of all frames (the others: of the first and last frame)
+    num_full: int = field(default=20, metadata=_NUMBER)
+    # number of trajectories with images, for each object: the first ones (None: all)
+    num_rendered: int | None = field(default=None, metadata=COUNT)
+    # additional visual images per object, in initial poses that are not simulated
+    num_views: int = field(default=0, metadata=_NUMBER)
     resolution: tuple[int, int] = (64, 64)  # height and width of the images (pixels)
     crop: bool = False  # images show the square around the object, as in the paper, instead of the whole pad
     shares: tuple[float, float, float] = (0.7, 0.1, 0.2)  # shares of objects for training, validation and test (sum 1)
-    objects_per_shard: int = 40  # number of objects in one shard, which is written as a whole or not at all
-    seed: int = 0  # seed of the objects, the trajectories and the split
+    # number of objects in one shard, which is written as a whole or not at all
+    objects_per_shard: int = field(default=40, metadata=COUNT)
+    seed: int = field(default=0, metadata=_NUMBER)  # seed of the objects, the trajectories and the split
     engine: physics.Engine = "mujoco"  # physics engine, see `physics.simulate` (trajectories differ between engines)
 
     @property
@@ -56,6 +65,7 @@ class Collection:
 
     def check(self) -> None:
         """Raise a ValueError if a field or the scenario is invalid."""
+        check_ranges(self)
         self.scenario.check()
         if min(self.shares) < 0 or not math.isclose(sum(self.shares), 1):
             raise ValueError(f"shares={self.shares}, but shares must be >= 0 and have sum 1")
@@ -68,18 +78,10 @@ class Collection:
             raise ValueError("categories is empty, but it must name at least one class, such as 'bottle'")
         for category in self.categories if self.meshes is None else ():
             objects.find_family(category)
-        for name, least in (
-            *(("num_objects", 1), ("num_per_object", 1), ("objects_per_shard", 1)),
-            *(("num_full", 0), ("num_views", 0), ("seed", 0)),
-        ):
-            value = getattr(self, name)
-            if not (type(value) is int and value >= least):
-                raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
         if len(self.resolution) != 2 or not all(type(side) is int and side >= 1 for side in self.resolution):
             raise ValueError(f"resolution must be two whole numbers of pixels (height, width), got {self.resolution!r}")
-        rendered, most = self.num_rendered, self.num_per_object
-        if rendered is not None and not (type(rendered) is int and 1 <= rendered <= most):
-            raise ValueError(f"num_rendered must be None or from 1 to num_per_object={most}, got {rendered!r}")
+        if self.rendered_per_object > self.num_per_object:
+            raise ValueError(f"num_rendered must be <= num_per_object={self.num_per_object}, got {self.num_rendered}")
 
 
 def class_names(collection: Collection) -> tuple[str, ...]:

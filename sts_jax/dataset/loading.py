@@ -75,14 +75,9 @@ def reduced(pairs: Pairs, size: int) -> Pairs:
 
 
 def reduced_images(images: dict[str, np.ndarray], size: int) -> dict[str, np.ndarray]:
-    """Reduce square images to a lower resolution. Each new pixel is the mean of a square block of pixels.
+    """Reduce square images `(*n, side, side, channels)` to `size` pixels, each the mean of a square block of pixels.
 
-    Args:
-        images: Images by name, uint8 or bool `(*n, side, side, channels)`.
-        size: New side length (pixels). It must divide `side`.
-
-    Returns:
-        The smaller images by name, of the same types. A bool pixel is true if at least half of its block is true.
+    A bool pixel is true if at least half of its block is true.
     """
     for image in images.values():
         height, width = image.shape[-3:-1]

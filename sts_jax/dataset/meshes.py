@@ -47,7 +47,7 @@ def survey_meshes(
     Args:
         folder: A folder as in `objects.library`.
         scenario: The scenario in which the objects are simulated.
-        classes: The classes to use, a subset of `mesh_classes(folder)`. Empty means all.
+        classes: The classes to use, a subset of `objects.library(folder).classes`. Empty means all.
         scale: Length of one unit of the files (m). Default: the value in ShapeNetSem's table, or 1 m for other files.
         up: The files' axis that becomes +z. Default: the axis in ShapeNetSem's table, y for glTF, z for other files.
         parts: See `Collection.parts`.
@@ -101,11 +101,6 @@ def _same(one: np.ndarray, other: np.ndarray) -> bool:
         return False
     pairs = ((one, other), (other, one))
     return all(spatial.cKDTree(x).query(y)[0].max() <= SAME for x, y in pairs)
-
-
-def mesh_classes(folder: str | os.PathLike[str]) -> tuple[str, ...]:
-    """List the classes of the mesh files in a folder, without opening a mesh."""
-    return objects.library(folder).classes
 
 
 @functools.lru_cache

@@ -46,11 +46,7 @@ def remedy(folder: Path) -> str:
 
 
 def manifest_of(folder: Path) -> Manifest | None:
-    """Read the manifest of a dataset, and check that this version of the library can read the dataset.
-
-    Returns:
-        The manifest, or None if nothing was collected into the folder.
-    """
+    """The manifest of a dataset that this version of the library can read, or None if nothing was collected."""
     path = folder / "collection.json"
     if path.exists():
         content = read_json(path, remedy(folder))
@@ -69,13 +65,7 @@ def manifest_of(folder: Path) -> Manifest | None:
 
 
 def write_images(path: Path, frames: Iterable[tuple[np.ndarray, ...]]) -> None:
-    """Write batches of images to an array_record file, as a whole or not at all.
-
-    Args:
-        path: The file.
-        frames: Batches. A batch of n frames is a tuple of arrays `(n, ...)`, one array per kind of image, such as
-            `Images`.
-    """
+    """Write batches of images, each a tuple of arrays `(n, ...)` such as `Images`, to an array_record file."""
 
     def write(temporary: Path) -> None:
         writer = _or_os_error(ArrayRecordWriter, str(temporary), WRITER_OPTIONS)
@@ -100,9 +90,7 @@ def read_images(path: Path, indices: np.ndarray, *, resolution: tuple[int, int],
     """Read some frames of a shard, in the given order.
 
     Args:
-        path: The `.array_record` file.
         indices: Indices of the records, int `(n,)`.
-        resolution: Height and width of every image (pixels).
         total: Number of records that the file must contain. A truncated file may open without an error.
     """
     height, width = resolution

@@ -42,10 +42,7 @@ def render(
     """Render the images of a shard in batches, on all CPU cores: frames of trajectories, then views.
 
     Args:
-        collection: The description of the dataset.
-        sensor: The sensor.
-        bodies: The objects of the shard.
-        trajectory: Their trajectories as NumPy arrays. `trajectory.body` is an index into `bodies`.
+        trajectory: Trajectories as NumPy arrays. `trajectory.body` is an index into `bodies`.
         frames: Trajectory and frame of each image, int `(m, 2)`, sorted by object.
         views: `pose` `(v, 7)` and `body`, int `(v,)`, an index into `bodies`, sorted by object.
         report: Called after each batch with the number of finished frames and views.
@@ -97,11 +94,7 @@ def render_uint8(
     resolution: tuple[int, int],
     crop: bool,
 ) -> tuple[UInt8[Array, "n h w 3"], UInt8[Array, "n h w 3"], Array]:
-    """Render n frames of one object as `sense` does, as 8-bit images.
-
-    Returns:
-        The visual images, the tactile images, and the segmentation, bool `(n, h, w)`.
-    """
+    """Render n frames as `sense` does: 8-bit visual and tactile images, and the segmentation, bool `(n, h, w)`."""
 
     def one(item: tuple[Array, Array]) -> tuple[Array, Array, Array]:
         frame = sense(sensor, body, *item, resolution=resolution, crop=crop)

@@ -12,8 +12,6 @@ from sts_jax.evaluation.catalogue import Metric as Metric
 from sts_jax.evaluation.catalogue import Scores as Scores
 from sts_jax.evaluation.catalogue import measurement_error as measurement_error
 from sts_jax.evaluation.figures.motion import outside as outside
-from sts_jax.evaluation.images import STREAMS as STREAMS
-from sts_jax.evaluation.images import image_summary as image_summary
 from sts_jax.evaluation.predictions import TRUE_STATE as TRUE_STATE
 from sts_jax.evaluation.predictions import Predicted as Predicted
 from sts_jax.evaluation.predictions import emptiness as emptiness
@@ -33,8 +31,10 @@ from sts_jax.evaluation.references import ONE_REROLL as ONE_REROLL
 from sts_jax.evaluation.references import baselines as baselines
 from sts_jax.evaluation.references import ceiling as ceiling
 from sts_jax.evaluation.references import image_baselines as image_baselines
+from sts_jax.evaluation.results import STREAMS as STREAMS
 from sts_jax.evaluation.results import full_table as full_table
 from sts_jax.evaluation.results import gain as gain
+from sts_jax.evaluation.results import image_summary as image_summary
 from sts_jax.evaluation.results import score as score
 from sts_jax.evaluation.results import scorer as scorer
 from sts_jax.evaluation.results import summarise as summarise

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -38,19 +38,10 @@ class Metric:
     # with the constant prediction's errors in the metric of this name.
     relative_to: str | None = None
     interval: bool = True  # true if tables show the interval
-    column: bool = True  # true if the complete table has the metric (summaries always have it)
     # "higher" or "lower": which values are better. The complete table then also shows the differences from the
     # baselines. None: it does not.
-    compared: str | None = None
+    compared: Literal["higher", "lower"] | None = None
     note: str = ""  # sentences above the table that explain the metric
-
-    def __post_init__(self) -> None:
-        if not self.name:
-            raise ValueError("the name of a metric must not be empty: give it a name, such as 'height_error'")
-        if self.compared not in ("higher", "lower", None):
-            raise ValueError(
-                f"metric {self.name!r}: `compared` must be 'higher', 'lower' or None, got {self.compared!r}"
-            )
 
     @property
     def title(self) -> str:
@@ -173,28 +164,38 @@ def _excess(errors: np.ndarray, weight: np.ndarray) -> float:
     return float((weight * errors[:, 1]).sum())
 
 
-def _image_metrics(stream: str, *, inside: bool) -> tuple[Metric, Metric, Metric]:
-    """Cross-entropy, excess and skill of a stream."""
-    errors, name = _image_errors(stream, inside=inside), f"{stream}_{{}}{'_object' if inside else ''}".format
-    words = stream + " {}" + (" on the object" if inside else "")
-    bce, excess = (lambda x, w, column=column: metrics.ratio(x[:, column], x[:, 2], w) for column in (0, 1))
-    note = "BCE is the binary cross-entropy of an image. BCE and excess are in nats per pixel and channel."
-    explained = (
-        "Excess is the cross-entropy of an image minus the entropy of the true image. Skill is 1 minus the ratio "
-        "of the excess to that of the constant prediction. With samples, it is the skill of their mean image."
+def _image_metrics(stream: str) -> tuple[Metric, ...]:
+    """Cross-entropy, excess and skill of a stream, and the skill on the object."""
+    whole, inside = (_image_errors(stream, inside=inside) for inside in (False, True))
+    mean = functools.partial(Metric, errors=whole, interval=False)
+    skill = functools.partial(
+        Metric,
+        reduce=_excess,
+        compared="higher",
+        note="Excess is the cross-entropy of an image minus the entropy of the true image. Skill is 1 minus the ratio "
+        "of the excess to that of the constant prediction. With samples, it is the skill of their mean image.",
     )
-    record = functools.partial(Metric, errors=errors, interval=False, column=not inside)
     return (
-        record(name("bce"), heading=words.format("BCE"), digits=4, reduce=bce, note=note),
-        record(name("excess"), heading=words.format("excess x1e-4"), factor=1e4, digits=1, reduce=excess),
-        Metric(
-            name("skill"),
-            errors,
-            heading=words.format("skill"),
-            reduce=_excess,
-            relative_to=name("skill"),
-            compared="higher",
-            note=explained,
+        mean(
+            f"{stream}_bce",
+            heading=f"{stream} BCE",
+            digits=4,
+            reduce=lambda errors, weight: metrics.ratio(errors[:, 0], errors[:, 2], weight),
+            note="BCE is the binary cross-entropy of an image. BCE and excess are in nats per pixel and channel.",
+        ),
+        mean(
+            f"{stream}_excess",
+            heading=f"{stream} excess x1e-4",
+            factor=1e4,
+            digits=1,
+            reduce=lambda errors, weight: metrics.ratio(errors[:, 1], errors[:, 2], weight),
+        ),
+        skill(f"{stream}_skill", whole, relative_to=f"{stream}_skill"),
+        skill(
+            f"{stream}_skill_object",
+            inside,
+            heading=f"{stream} skill on the object",
+            relative_to=f"{stream}_skill_object",
         ),
     )
 
@@ -202,17 +203,13 @@ def _image_metrics(stream: str, *, inside: bool) -> tuple[Metric, Metric, Metric
 _position, _angle, _axis = (
     _of_pose(function) for function in (metrics.position_error, metrics.geodesic_angle, metrics.axis_angle)
 )
-_VISUAL, _VISUAL_OBJECT, _TACTILE, _TACTILE_OBJECT = (
-    _image_metrics(stream, inside=inside) for stream in ("visual", "tactile") for inside in (False, True)
-)
 _millimetres = functools.partial(Metric, unit="mm", factor=1e3, digits=1)
 _degrees = functools.partial(Metric, unit="deg", factor=180 / np.pi, digits=0, interval=False)
 _AXIS_NOTE = "The up axis is the z axis of the object. Its error is the angle between the predicted and the true axis."
 LOG_LOSS, CALIBRATION = "outcome_log_loss", "outcome_calibration_error"  # names of metrics
 # In the order of the columns of the complete table. Values in summaries are in SI units.
 METRICS: tuple[Metric, ...] = (
-    *_VISUAL,
-    _VISUAL_OBJECT[2],
+    *_image_metrics("visual"),
     Metric(
         "visual_skill_best",
         _best_errors,
@@ -231,8 +228,7 @@ METRICS: tuple[Metric, ...] = (
         note="Sharpness is the gradient energy of the visual samples divided by that of the true images. Gradient "
         "energy is the sum of the squared differences of neighbouring pixels.",
     ),
-    *_TACTILE,
-    _TACTILE_OBJECT[2],
+    *_image_metrics("tactile"),
     _millimetres("position", _position, interval=False),
     _millimetres("position_median", _position, heading="position, median", reduce=metrics.median, interval=False),
     _millimetres(
@@ -304,8 +300,6 @@ METRICS: tuple[Metric, ...] = (
         note="The ROC area is the probability that an object that falls off has a higher predicted probability of "
         "falling off than one that stays.",
     ),
-    *_VISUAL_OBJECT[:2],
-    *_TACTILE_OBJECT[:2],
 )
 
 

@@ -55,13 +55,7 @@ class Distance(NamedTuple):
 
 
 def pixel_errors(real: np.ndarray, simulated: np.ndarray, group: np.ndarray) -> PixelErrors:
-    """Compute the MAE, RMSE, PSNR and SSIM between real and simulated images of matched sets.
-
-    Args:
-        real: Real images, uint8 `(n, height, width, 3)`.
-        simulated: Simulated images of the same shape.
-        group: Number of the trajectory of each image, int `(n,)`.
-    """
+    """Compute the MAE, RMSE, PSNR and SSIM between images of matched sets. `group` has the trajectory of each image."""
     for name, images in (("real", real), ("simulated", simulated)):
         if images.dtype != np.uint8:
             raise ValueError(f"{name} must be uint8, got {images.dtype}")
@@ -86,9 +80,6 @@ def features(images: np.ndarray) -> np.ndarray:
     The colours are the means of the three channels in a cell. The gradients are the mean absolute differences of
     neighbouring pixels of the grey image, in four directions (horizontal, vertical and both diagonals) and at three
     scales. Brightness, vignetting and tint affect the colours. Noise, blur, edges and texture affect the gradients.
-
-    Args:
-        images: Images, uint8 `(n, height, width, 3)`, at least 64 pixels high and wide.
 
     Returns:
         Features in [0, 1], `(n, 240)`: 48 colours (16 cells, 3 channels), then the gradients (16 cells, 4 directions)
@@ -118,7 +109,6 @@ def energy_distance(
     Args:
         real: Features of the real images, from `features`, `(n, k)`.
         real_group: Number of the trajectory of each real image, int `(n,)`.
-        simulated_group: Number of the trajectory of each simulated image, int `(m,)`.
 
     Source: Szekely and Rizzo (2013), Energy statistics: a class of statistics based on distances.
     """

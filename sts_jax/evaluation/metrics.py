@@ -30,13 +30,7 @@ class ImageError(NamedTuple):
 
 
 def image_error(predicted: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None) -> ImageError:
-    """Compute the binary cross-entropy of predicted images, and its excess over the entropy of the targets.
-
-    Args:
-        predicted: Predicted images in [0, 1], `(n, height, width, 3)`.
-        target: True images in [0, 1], `(n, height, width, 3)`.
-        mask: The pixels to use, bool `(n, height, width)` (default: all).
-    """
+    """Errors of predicted images in [0, 1], `(n, height, width, 3)`, in the pixels of a bool mask (default: all)."""
     if len(target) > _CHUNK:
         cuts = [slice(start, start + _CHUNK) for start in range(0, len(target), _CHUNK)]
         parts = [image_error(predicted[c], target[c], None if mask is None else mask[c]) for c in cuts]
@@ -58,14 +52,7 @@ def best_of(errors: Sequence[ImageError]) -> ImageError:
 
 
 def gradient_energy(images: np.ndarray) -> np.ndarray:
-    """Compute the sum of the squared differences of neighbouring pixels along both axes, a measure of sharpness.
-
-    Args:
-        images: Images in [0, 1], `(*n, height, width, 3)`.
-
-    Returns:
-        Sums over pixels and channels, `(*n,)`.
-    """
+    """Sum of the squared differences of neighbouring pixels of images `(*n, height, width, 3)`, over all channels."""
     down, across = (np.diff(images, axis=axis) for axis in (-3, -2))
     return (down.astype(np.float64) ** 2).sum((-3, -2, -1)) + (across.astype(np.float64) ** 2).sum((-3, -2, -1))
 
@@ -82,10 +69,7 @@ def geodesic_angle(predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def axis_angle(predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Compute the angles (rad) between the up axes, which are the z axes of the objects, of poses `(n, 7)`.
-
-    The angle does not change with rotations about the up axis, which are invisible for round objects.
-    """
+    """Angles (rad) between the z axes of poses `(n, 7)`. Round objects look the same after rotations about it."""
     w, x, y, z = (np.stack([predicted, target])[..., i].astype(np.float64) for i in range(3, 7))
     up = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), w**2 - x**2 - y**2 + z**2], -1)
     return np.arctan2(np.linalg.norm(np.cross(up[0], up[1]), axis=-1), (up[0] * up[1]).sum(-1))
@@ -100,9 +84,6 @@ def energy_score(samples: np.ndarray, target: np.ndarray) -> np.ndarray:
     Args:
         samples: k samples of n positions with d coordinates, `(k, n, d)`.
         target: True positions, `(n, d)`.
-
-    Returns:
-        Scores in the unit of the positions, `(n,)`.
 
     Source: Gneiting and Raftery (2007), Strictly proper scoring rules, prediction, and estimation.
     """
@@ -141,17 +122,10 @@ def coverage(samples: np.ndarray, target: np.ndarray, level: float = LEVEL) -> n
 
 
 def centre(samples: np.ndarray, *, iterations: int = 100) -> np.ndarray:
-    """Compute the central pose of samples.
+    """Central poses `(n, 7)` of k samples `(k, n, 7)`.
 
-    The position is the geometric median. The orientation is that of the sample with the smallest mean angle to the
-    other samples.
-
-    Args:
-        samples: k samples of n poses, `(k, n, 7)`.
-        iterations: Number of iterations of Weiszfeld's method, which computes the geometric median.
-
-    Returns:
-        Central poses, `(n, 7)`.
+    The position is the geometric median, by `iterations` of Weiszfeld's method. The orientation is that of the sample
+    with the smallest mean angle to the other samples.
     """
     place = samples[..., :3].astype(np.float64)
     middle = place.mean(0)
@@ -165,13 +139,7 @@ def centre(samples: np.ndarray, *, iterations: int = 100) -> np.ndarray:
 
 
 def log_loss(probability: np.ndarray, label: np.ndarray, floor: float = FLOOR) -> np.ndarray:
-    """Compute the negative logarithms of the probabilities of the true outcomes (nats), `(n,)`.
-
-    Args:
-        probability: Probabilities of c outcomes for n items, `(n, c)`.
-        label: Column of the true outcome of each item, int `(n,)`.
-        floor: Smaller probabilities are replaced by this one.
-    """
+    """Negative logarithms of the probabilities `(n, c)` of the true outcomes, in the columns `label` (nats)."""
     return -np.log(np.maximum(probability[np.arange(len(label)), label], floor))
 
 
@@ -214,13 +182,11 @@ class Reliability(NamedTuple):
 def reliability(
     confidence: np.ndarray, right: np.ndarray, weight: np.ndarray | None = None, *, bins: int = BINS
 ) -> Reliability:
-    """Compute the data of a reliability diagram.
+    """Compute the data of a reliability diagram, with `bins` of equal width in [0, 1].
 
     Args:
         confidence: Probability of the likeliest outcome of each item, `(n,)`.
         right: True if the likeliest outcome is the true one, bool `(n,)`.
-        weight: Weights of the items, `(n,)`.
-        bins: Number of bins of equal width in [0, 1].
     """
     w = np.ones(len(right)) if weight is None else weight
     place = np.minimum((confidence * bins).astype(int), bins - 1)
@@ -232,9 +198,7 @@ def reliability(
 def calibration_error(
     confidence: np.ndarray, right: np.ndarray, weight: np.ndarray | None = None, *, bins: int = BINS
 ) -> float:
-    """Compute the expected calibration error: the mean over items of |accuracy - confidence| of their bin.
-
-    The arguments are those of `reliability`. The error is NaN if the sum of the weights is 0.
+    """Mean over items of |accuracy - confidence| of their bin in the diagram of `reliability`, NaN without weights.
 
     Source: Guo et al. (2017), On calibration of modern neural networks.
     """
@@ -245,15 +209,9 @@ def calibration_error(
 
 
 def auc(positive: np.ndarray, score: np.ndarray, weight: np.ndarray | None = None) -> float:
-    """Compute the area under the ROC curve: the probability that a positive item scores above a negative one.
+    """Area under the ROC curve: the probability that a positive item scores above a negative one (equal: half).
 
-    Args:
-        positive: True for positive items, bool `(n,)`.
-        score: Scores of the items, `(n,)`. Pairs with equal scores count half.
-        weight: Weights of the items, `(n,)`.
-
-    Returns:
-        The area, or NaN if no item with a positive weight is positive, or none is negative.
+    NaN if no item with a weight is positive, or none is negative.
     """
     # scikit-learn's roc_auc_score gives the same value, but takes about thirty times as long. The bootstrap of the
     # intervals calls this function thousands of times.
@@ -265,16 +223,7 @@ def auc(positive: np.ndarray, score: np.ndarray, weight: np.ndarray | None = Non
 
 
 def balanced_accuracy(predicted: np.ndarray, target: np.ndarray, weight: np.ndarray | None = None) -> float:
-    """Compute the share of correctly predicted items in each class, averaged over the classes.
-
-    Args:
-        predicted: Predicted classes, int `(n,)`.
-        target: True classes, int `(n,)`. Only classes that occur here are used.
-        weight: Weights of the items, `(n,)`.
-
-    Returns:
-        The balanced accuracy, or NaN if the sum of the weights is 0.
-    """
+    """Share of correctly predicted items in each class of `target`, averaged over the classes, NaN without weights."""
     w = np.ones(len(target)) if weight is None else weight
     shares = []
     for label in np.unique(target):
@@ -306,10 +255,7 @@ def bootstrap(
 
     Args:
         groups: Group of each item, such as its object, `(n,)`.
-        statistic: Function of the weights of the items, `(n,)`. A weight is how often the item's group was drawn.
-
-    Returns:
-        Values of the statistic, `(num, ...)`.
+        statistic: Function of the weights of the items, `(n,)`: how often the group of each item was drawn.
     """
     rng = np.random.default_rng(seed)
     _, member = np.unique(groups, return_inverse=True)
@@ -325,5 +271,4 @@ def interval(draws: np.ndarray) -> tuple[float, float]:
 
 
 def _xlogx(x: np.ndarray) -> np.ndarray:
-    """x log x, with the value 0 at x = 0."""
     return np.where(x > 0, x * np.log(np.where(x > 0, x, 1)), 0)

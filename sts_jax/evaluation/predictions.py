@@ -75,15 +75,7 @@ def emptiness(visual: np.ndarray, blank: np.ndarray) -> np.ndarray:
 
 
 def shares(outcome: np.ndarray, outcomes: Sequence[enum.IntEnum]) -> np.ndarray:
-    """Estimate probabilities of outcomes from k samples: `(count + 1 / c) / (k + 1)`, which is never 0.
-
-    Args:
-        outcome: Outcomes of k samples for each of n items, int `(k, n)`.
-        outcomes: The c outcomes of the scenario, `scenario.outcomes`.
-
-    Returns:
-        Probabilities, `(n, c)`, with the columns in the order of `outcomes`.
-    """
+    """Probabilities `(n, c)` of c outcomes from k samples `(k, n)`: `(count + 1 / c) / (k + 1)`, which is never 0."""
     counts = (outcome[..., None] == np.array([int(one) for one in outcomes])).sum(0)
     return (counts + 1 / len(outcomes)) / (len(outcome) + 1)
 
@@ -94,26 +86,17 @@ def frequency(outcome: np.ndarray, outcomes: Sequence[enum.IntEnum]) -> np.ndarr
 
 
 def train_share(shares: Sequence[float], split: str) -> float:
-    """Return the share of the objects or trajectories that is used for training.
-
-    Args:
-        shares: Shares of the objects for training, validation and test, `Collection.shares`.
-        split: `object` or `trajectory`. A split by trajectory uses the validation share for training.
-    """
+    """Share of `Collection.shares` that trains a model. A split by trajectory includes the share of the validation."""
     return shares[0] if split == "object" else 1 - shares[2]
 
 
 def rows_of(data: Dataset, split: str = "object") -> dict[str, np.ndarray]:
-    """Split the trajectories of a dataset that have images into parts for training, validation and test.
+    """Indices of the trajectories with images in each part, `train`, `validation` and `test`.
 
     Args:
-        data: The dataset.
-        split: With `object`, whole objects are held out, and `Dataset.split` contains the objects of each part. With
-            `trajectory`, random trajectories are held out, as in the paper (Rezaei-Shoshtari et al. 2021). The training
-            and the test part then have objects in common, and the validation part equals the training part.
-
-    Returns:
-        Indices of the trajectories, int `(n,)`, for each of `train`, `validation` and `test`.
+        split: With `object`, whole objects are held out, see `Dataset.split`. With `trajectory`, random trajectories
+            are held out, as in the paper (Rezaei-Shoshtari et al. 2021). The training and the test part then have
+            objects in common, and the validation part equals the training part.
     """
     if split == "object":
         return {name: data.members(name) for name in ("train", "validation", "test")}
@@ -126,16 +109,11 @@ def rows_of(data: Dataset, split: str = "object") -> dict[str, np.ndarray]:
 
 
 def subsets(modalities: Sequence[str], *, state: bool = False) -> dict[str, tuple[str, ...]]:
-    """List the non-empty subsets of a model's inputs. For a model without inputs, the result has the empty subset.
+    """The non-empty subsets of a model's inputs (or the empty one), by a description such as "from visual and pose".
 
     Args:
-        modalities: The inputs of the model, `predictor.modalities`.
-        state: True to add the subset ("visual", "state"), if the visual image is an input. Here, "state" is the true
-            pose, shape and mass, which state-space models accept as an input.
-
-    Returns:
-        The subsets by their description, such as "from visual and pose", "from all inputs" or "from visual and the
-        true state".
+        state: True to add the subset ("visual", "state"), if the visual image is an input. "state" is the true pose,
+            shape and mass, which state-space models accept as an input.
     """
     usable = tuple(modalities)
     if not usable:

@@ -154,9 +154,8 @@ def ceiling(
     image can exceed the ceiling, because touch reveals a part of the hidden properties.
 
     Args:
-        collection: The description of the dataset that contains the items.
         times: Number of re-rolls per item, >= 1.
-        progress: Function that is called with the number of re-rolls simulated so far, over all items.
+        progress: Called with the number of re-rolls simulated so far, over all items.
 
     Returns:
         A prediction with the re-rolls as samples (images in `uint8`, of the resolution of `test`). The images are the
@@ -210,10 +209,7 @@ def _render(
     wrench: np.ndarray,
     size: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Render both streams of all last frames (`uint8`), object by object, with one thread per CPU core.
-
-    The images have the resolution of the collection. They are reduced to `size` if its height is not `size`.
-    """
+    """Render both streams of all last frames (`uint8`, `size` pixels), object by object, on all CPU cores."""
     same, batch = size == collection.resolution[0], dataset.frames_per_call()
     jobs = [
         np.flatnonzero(owner == index)[start : start + batch]

@@ -1,4 +1,4 @@
-"""The table of results: `score` computes errors, `summarise` metrics with intervals, and `table` shows them."""
+"""Results: `score` computes errors, `summarise` and `image_summary` metrics with intervals, and `table` shows them."""
 
 import enum
 import functools
@@ -9,10 +9,12 @@ import numpy as np
 from sts_jax import physics
 from sts_jax.dataset import Pairs
 from sts_jax.evaluation.catalogue import COLUMNS, LOG_LOSS, METRICS, Column, Metric, Scores
-from sts_jax.evaluation.metrics import bootstrap, interval, skill
-from sts_jax.evaluation.predictions import OUTCOMES, Predicted, named
+from sts_jax.evaluation.metrics import bootstrap, image_error, interval, ratio, skill
+from sts_jax.evaluation.predictions import OUTCOMES, Predicted, in_unit, named
 from sts_jax.evaluation.predictions import frequency as frequency_of
-from sts_jax.evaluation.references import BASELINES, CEILINGS, CONSTANT
+from sts_jax.evaluation.references import BASELINES, CEILINGS, CONSTANT, COPY, Streams
+
+STREAMS = ("visual", "tactile")
 
 
 def score(
@@ -219,6 +221,60 @@ def gain(
     return _cell(value, bootstrap(test.object, statistic, num=num, seed=seed))
 
 
+def image_summary(
+    predictions: Mapping[str, Predicted], test: Streams, *, num: int = 2000, seed: int = 0
+) -> dict[str, dict]:
+    """Compute cross-entropy and skill of predicted images, with 95 % bootstrap intervals over trajectories.
+
+    Args:
+        predictions: Predictions by name, with those of `image_baselines`.
+
+    Returns:
+        A dictionary for each of the streams `visual` and `tactile`, with the following entries.
+
+        - `floor`: The entropy of the true images (nats per pixel and channel).
+        - `predictors`: The metrics by predictor: the cross-entropy `bce` (nats per pixel and channel), and the skills
+            relative to the mean training image (`skill`) and to the first image (`skill_copy`), each a dictionary as in
+            `summarise`.
+    """
+    missing = [name for name in (CONSTANT, COPY) if name not in predictions]
+    if missing:
+        raise ValueError(
+            f"`predictions` lacks {' and '.join(map(repr, missing))}: add the results of evaluation.image_baselines"
+        )
+    return {stream: _of_stream(predictions, test, stream, num, seed) for stream in STREAMS}
+
+
+def _of_stream(predictions: Mapping[str, Predicted], test: Streams, stream: str, num: int, seed: int) -> dict:
+    """The part of `image_summary` for one stream."""
+    truth, errors = getattr(test, stream)[:, 1].astype(np.float32) / 255, {}
+    for name, predicted in predictions.items():
+        images = getattr(predicted, stream)
+        if images is None:
+            continue
+        if images.shape != truth.shape:
+            raise ValueError(
+                f"prediction {name!r}: {stream} has shape {images.shape}, but the true images have shape {truth.shape}"
+            )
+        errors[name] = image_error(in_unit(images), truth)
+    constant, copy = errors[CONSTANT], errors[COPY]
+
+    def numbers(weight: np.ndarray) -> np.ndarray:
+        bce = [ratio(error.bce, error.pixels, weight) for error in errors.values()]
+        skills = [[skill(error.excess, base.excess, weight) for base in (constant, copy)] for error in errors.values()]
+        return np.column_stack([bce, skills])
+
+    value, draws = numbers(np.ones(len(truth))), bootstrap(np.arange(len(truth)), numbers, num=num, seed=seed)
+    cells = {
+        name: {
+            key: dict(zip(("value", "low", "high"), (float(value[i, k]), *interval(draws[:, i, k])), strict=True))
+            for k, key in enumerate(("bce", "skill", "skill_copy"))
+        }
+        for i, name in enumerate(errors)
+    }
+    return {"floor": ratio(constant.bce - constant.excess, constant.pixels), "predictors": cells}
+
+
 def _cell(number: float, sample: np.ndarray) -> dict | None:
     """A value and its interval from bootstrap samples, or None if the value is not finite."""
     if not np.isfinite(number):
@@ -257,20 +313,19 @@ def full_table(summary: dict, *, title: str, notes: Sequence[str] = (), metrics:
 
     Args:
         summary: The result of `summarise`.
-        metrics: The metrics, in the order of the columns. Those whose field `column` is False are left out.
+        metrics: The metrics, in the order of the columns.
     """
-    shown = [metric for metric in metrics if metric.column]
-    lines = _head(["predictor", *(metric.title for metric in shown)])
+    lines = _head(["predictor", *(metric.title for metric in metrics)])
     for name, cells in summary["predictors"].items():
-        lines.append(_row([name, *(_shown(cells, metric, interval=metric.interval) for metric in shown)]))
-    compared = [metric for metric in shown if metric.compared is not None]
+        lines.append(_row([name, *(_shown(cells, metric, interval=metric.interval) for metric in metrics)]))
+    compared = [metric for metric in metrics if metric.compared is not None]
     lines += ["", _directions(compared), "", *_head(["predictor", "baseline", *(metric.title for metric in compared)])]
     for name, against in summary["differences"].items():
         for base, differences in against.items():
             texts = [_shown(differences, metric, interval=True) for metric in compared]
             if set(texts) != {"-"}:
                 lines.append(_row([name, base, *texts]))
-    return _page(summary, title, shown, lines, notes)
+    return _page(summary, title, metrics, lines, notes)
 
 
 def _head(cells: Sequence[str]) -> list[str]:

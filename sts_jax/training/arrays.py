@@ -54,12 +54,7 @@ class Arrays:
         return len(next(iter(self.targets.values())))
 
     def take(self, index: np.ndarray, **further: np.ndarray) -> Batch:
-        """The arrays of one batch by field. `empty` is included as a whole.
-
-        Args:
-            index: Indices of the samples.
-            further: Indices into the fields `views` and `falls`, which the batch lacks otherwise.
-        """
+        """The arrays of some samples by field, with `empty`, and with the rows `further` of `views` and `falls`."""
         batch = jax.tree.map(lambda x: x[index], self._tree()) | {"empty": self.empty}
         return batch | {name: {k: x[rows] for k, x in getattr(self, name).items()} for name, rows in further.items()}
 
@@ -79,8 +74,7 @@ class Arrays:
 def order(seed: int, samples: int, batch_size: int, start: int, stop: int) -> Iterator[np.ndarray]:
     """Iterate over the batches `start` to `stop` - 1 of a training, each as sample indices `(batch_size,)`.
 
-    Each epoch is a random permutation of all samples. A batch may contain the end of one epoch and the start of the
-    next. The samples in batch k do not depend on `start` and `stop`, so that a resumed training uses the same batches.
+    Each epoch is a random permutation of all samples. Batch k does not depend on `start` and `stop`.
     """
     permutations: dict[int, np.ndarray] = {}
     for number in range(start, stop):
@@ -235,8 +229,6 @@ def state_arrays(
     Args:
         pairs: From `dataset.Dataset.pairs`, with images of `model.input_size` pixels on each side.
         model: From `state_model`.
-        scenario: Scenario of the trajectories.
-        preprocessing: Encodes poses and conditions, and detects contacts.
         empty: `visual` and `tactile` image of the empty sensor, uint8, from `dataset.empty_frame`.
         views: From `dataset.Dataset.views`. They are used only if `visual` is an input of the model.
         falls: Further trajectories without images, from `dataset.Dataset.ends`.
