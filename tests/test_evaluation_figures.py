@@ -69,7 +69,7 @@ def drawn(monkeypatch):
 
 def test_predictions_show_input_truth_mean_and_four_samples_of_both_streams(tmp_path, drawn):
     test, predicted = judged(k=5)
-    figures.predictions(tmp_path / "a.png", test, predicted, num=2, title="t")
+    figures.predictions(tmp_path / "a.png", test, predicted, num=2, title="t", scenario=sts.physics.Freefall())
     axes = np.array(drawn[0].axes).reshape(4, 7)  # two items, each visual and tactile
     heads = ["input", "truth", "mean of samples", "sample 1", "sample 2", "sample 3", "sample 4"]
     assert [axis.get_title() for axis in axes[0]] == heads

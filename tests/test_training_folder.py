@@ -234,7 +234,7 @@ def test_a_model_is_loaded_without_any_optimiser(folder, finished, tmp_path, mon
         sign(path)
     with pytest.raises(ValueError, match="no state of this optimiser"):
         train(begun)
-    monkeypatch.setattr("sts_jax.training.loop.optimiser", lambda *_: pytest.fail("an optimiser was built"))
+    monkeypatch.setattr("sts_jax.training.loop._default_optimiser", lambda *_: pytest.fail("an optimiser was built"))
     same(training.load(folder).state, finished[1].state)
     same(train(folder).state, finished[1].state)  # a finished run
     assert training.load(begun).step == 2

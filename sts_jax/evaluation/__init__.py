@@ -14,7 +14,6 @@ from sts_jax.evaluation.catalogue import measurement_error as measurement_error
 from sts_jax.evaluation.figures.motion import outside as outside
 from sts_jax.evaluation.predictions import TRUE_STATE as TRUE_STATE
 from sts_jax.evaluation.predictions import Predicted as Predicted
-from sts_jax.evaluation.predictions import emptiness as emptiness
 from sts_jax.evaluation.predictions import first as first
 from sts_jax.evaluation.predictions import frequency as frequency
 from sts_jax.evaluation.predictions import joined as joined

@@ -91,10 +91,12 @@ def _image_errors(stream: str, *, inside: bool) -> Callable[[Predicted, Pairs], 
 
 
 def _best_errors(predicted: Predicted, test: Pairs) -> np.ndarray | None:
+    """Errors of the sample with the smallest excess."""
     if predicted.samples is None or predicted.samples.visual is None:
         return None
     truth = test.visual[:, 1] / 255
-    return np.stack(metrics.best_of([metrics.image_error(in_unit(x), truth) for x in predicted.samples.visual]), 1)
+    errors = np.array([np.stack(metrics.image_error(in_unit(x), truth), 1) for x in predicted.samples.visual])
+    return errors[errors[..., 1].argmin(0), np.arange(len(truth))]
 
 
 def _gradients(predicted: Predicted, test: Pairs) -> np.ndarray | None:

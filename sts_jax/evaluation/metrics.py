@@ -7,7 +7,7 @@ is `BCE(x, p) = -x log p - (1 - x) log(1 - p) = H(x) + KL(x || p)`, with the ent
 skill is `1 - excess / constant_excess`, where `constant_excess` is the excess of the mean training image.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -42,13 +42,6 @@ def image_error(predicted: np.ndarray, target: np.ndarray, mask: np.ndarray | No
     entropy = -(_xlogx(x) + _xlogx(1 - x))
     total, excess = ((values.sum(-1) * weight).sum((1, 2)) for values in (bce, bce - entropy))
     return ImageError(total, excess, 3 * weight.sum((1, 2)))
-
-
-def best_of(errors: Sequence[ImageError]) -> ImageError:
-    """Select the sample with the smallest excess for each item, from one `ImageError` per sample."""
-    excess = np.stack([error.excess for error in errors])
-    best, item = excess.argmin(0), np.arange(excess.shape[1])
-    return ImageError(*(np.stack(leaves)[best, item] for leaves in zip(*errors, strict=True)))
 
 
 def gradient_energy(images: np.ndarray) -> np.ndarray:

@@ -16,7 +16,6 @@ from sts_jax.dataset.measurement import NAMES
 from sts_jax.evaluation.metrics import best_threshold
 
 TRUE_STATE = "visual and the true state"  # the true state: pose, shape and mass of the object, from the simulation
-OUTCOMES: tuple[enum.IntEnum, ...] = tuple(physics.Outcome)
 _FELL_OFF = int(physics.Outcome.FELL_OFF)
 _CHUNK = 64  # number of trajectories that one call predicts
 
@@ -59,19 +58,9 @@ def in_unit(image: np.ndarray) -> np.ndarray:
     return image.astype(np.float32) / 255 if image.dtype == np.uint8 else image
 
 
-def named(outcome: int, outcomes: Sequence[enum.IntEnum] = OUTCOMES) -> str:
-    """Return the name of an outcome, such as `fell_off`."""
-    return {int(one): one.name.lower() for one in outcomes}[outcome]
-
-
 def outcome_of_pose(scenario: physics.Scenario, first: np.ndarray, last: np.ndarray) -> np.ndarray:
     """Determine the outcomes, int `(n,)`, from first poses and true or predicted last poses, `(n, 7)`."""
     return np.asarray(jax.vmap(scenario.outcome)(jnp.asarray(first), jnp.asarray(last)))
-
-
-def emptiness(visual: np.ndarray, blank: np.ndarray) -> np.ndarray:
-    """Compute the mean absolute difference between images in [0, 1] and the empty image, `(n,)`."""
-    return np.abs(visual - blank).mean((1, 2, 3))
 
 
 def shares(outcome: np.ndarray, outcomes: Sequence[enum.IntEnum]) -> np.ndarray:
@@ -177,9 +166,8 @@ def predict(
     if out.pose is not None:
         out = out._replace(outcome=outcome_of_pose(scenario, test.pose[:, 0], out.pose))
     elif out.visual is not None and len(scenario.stays) == 1 and validation is not None and blank is not None:
-        score = emptiness(np.asarray(run(validation, 0).visual), blank)
-        threshold = best_threshold(score, validation.outcome != _FELL_OFF)
-        empty = emptiness(out.visual, blank) <= threshold
+        score, judged = (np.abs(x - blank).mean((1, 2, 3)) for x in (np.asarray(run(validation, 0).visual), out.visual))
+        empty = judged <= best_threshold(score, validation.outcome != _FELL_OFF)
         out = out._replace(outcome=np.where(empty, _FELL_OFF, int(scenario.stays[0])))
     if out.samples is not None and out.samples.pose is not None and out.outcome_probability is None:
         ends = np.stack([outcome_of_pose(scenario, test.pose[:, 0], pose) for pose in out.samples.pose])

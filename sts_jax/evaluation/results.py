@@ -10,7 +10,7 @@ from sts_jax import physics
 from sts_jax.dataset import Pairs
 from sts_jax.evaluation.catalogue import COLUMNS, LOG_LOSS, METRICS, Column, Metric, Scores
 from sts_jax.evaluation.metrics import bootstrap, image_error, interval, ratio, skill
-from sts_jax.evaluation.predictions import OUTCOMES, Predicted, in_unit, named
+from sts_jax.evaluation.predictions import Predicted, in_unit
 from sts_jax.evaluation.predictions import frequency as frequency_of
 from sts_jax.evaluation.references import BASELINES, CEILINGS, CONSTANT, COPY, Streams
 
@@ -36,11 +36,9 @@ def score(
         outcomes: The outcomes of the scenario, `scenario.outcomes`, for predictions with `outcome_probability`.
         frequency: Frequency of each outcome among the training trajectories, `(c,)`, from `evaluation.frequency`. If it
             is None, the predicted outcome is `predicted.outcome`, or else the likeliest outcome.
-        metrics: The metrics of the evaluation.
 
     Returns:
-        The results of `Metric.errors` for the predicted items, by the name of the metric. Metrics of quantities that
-        are not predicted are missing.
+        The results of `Metric.errors` by the name of the metric, without metrics of quantities that are not predicted.
     """
     leaves = (
         *(predicted.visual, predicted.tactile, predicted.pose, predicted.outcome, predicted.outcome_probability),
@@ -68,10 +66,7 @@ def score(
 def scorer(
     scenario: physics.Scenario, train: Pairs, *, metrics: Sequence[Metric] = METRICS
 ) -> Callable[[Predicted, Pairs], Scores]:
-    """Return `score` as a function of a prediction and the held-out items.
-
-    The outcomes are those of the scenario, with their frequencies in the training set.
-    """
+    """`score` as a function of a prediction and the held-out items, with the outcomes' frequencies in `train`."""
     frequencies = frequency_of(train.outcome, scenario.outcomes)
     return functools.partial(score, outcomes=scenario.outcomes, frequency=frequencies, metrics=metrics)
 
@@ -100,7 +95,7 @@ def summarise(
     test: Pairs,
     *,
     metrics: Sequence[Metric] = METRICS,
-    outcomes: Sequence[enum.IntEnum] = OUTCOMES,
+    outcomes: Sequence[enum.IntEnum] = tuple(physics.Outcome),
     num: int = 2000,
     seed: int = 0,
 ) -> dict:
@@ -135,7 +130,7 @@ def summarise(
             f"`scores` lacks {' and '.join(map(repr, missing))}: add the scores of the predictions of "
             "evaluation.baselines"
         )
-    items = len(test.object)
+    items, names = len(test.object), {int(outcome): outcome.name.lower() for outcome in outcomes}
     scored = {name: len(next(iter(of_predictor.values()), test.object)) for name, of_predictor in scores.items()}
     statistics = [
         [_statistic(metric, of_predictor, scores[CONSTANT], test.take(slice(scored[name]))) for metric in metrics]
@@ -156,17 +151,17 @@ def summarise(
     def cells(values: np.ndarray, sample: np.ndarray) -> dict:
         return {key: _cell(values[k], sample[:, k]) for k, key in enumerate(keys)}
 
-    names = list(scores)
-    reference = {name: names.index(name) for name in BASELINES}
+    rows = list(scores)
+    reference = {name: rows.index(name) for name in BASELINES}
     return {
         "items": items,
         "objects": len(np.unique(test.object)),
-        "outcomes": {named(int(o), outcomes): int((test.outcome == o).sum()) for o in np.unique(test.outcome)},
+        "outcomes": {names[int(o)]: int((test.outcome == o).sum()) for o in np.unique(test.outcome)},
         "scored": scored,
-        "predictors": {name: cells(value[i], draws[:, i]) for i, name in enumerate(names)},
+        "predictors": {name: cells(value[i], draws[:, i]) for i, name in enumerate(rows)},
         "differences": {
             name: {base: cells(value[i] - value[j], draws[:, i] - draws[:, j]) for base, j in reference.items()}
-            for i, name in enumerate(names)
+            for i, name in enumerate(rows)
             if name not in (*reference, *CEILINGS)
         },
     }
@@ -200,16 +195,10 @@ def _statistic(metric: Metric, scores: Scores, constant: Scores, test: Pairs) ->
 def gain(
     before: Scores, after: Scores, test: Pairs, *, metric: str = LOG_LOSS, num: int = 2000, seed: int = 0
 ) -> dict | None:
-    """Compute the relative reduction `1 - b / a` of a mean error from one predictor (a) to another (b).
-
-    Args:
-        before: Scores of the first predictor, for instance from vision.
-        after: Scores of the second predictor, for instance from vision and touch.
-        metric: Name of a metric that is a mean of its errors. The default is the log loss of the outcome.
+    """Compute the relative reduction `1 - after / before` of a mean error, such as from vision to vision and touch.
 
     Returns:
-        A dictionary of `value` and of the limits `low` and `high` of its 95 % interval, or None if a predictor lacks
-        the metric or the reduction is not finite.
+        A dictionary as in `summarise`, or None if a predictor lacks the metric or the reduction is not finite.
     """
     if metric not in before or metric not in after:
         return None

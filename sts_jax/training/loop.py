@@ -73,8 +73,6 @@ class TrainConfig:
             raise ValueError(
                 f"checkpoint_every must be a multiple of log_every ({self.log_every}), got {self.checkpoint_every}"
             )
-        if self.schedule not in ("constant", "cosine"):
-            raise ValueError(f"schedule must be 'constant' or 'cosine', got {self.schedule!r}")
 
     def total(self, samples: int) -> int:
         """The number of gradient steps for a training set of `samples` samples."""
@@ -108,10 +106,7 @@ def _labels(params: Any) -> Any:
     )
 
 
-def _or_default(
-    given: optax.GradientTransformation | None, config: TrainConfig, total: int
-) -> optax.GradientTransformation:
-    return given or optimiser(config, total)
+_default_optimiser = optimiser  # some functions have an argument `optimiser`
 
 
 class Learner(NamedTuple):
@@ -149,7 +144,7 @@ def initial(
 ) -> tuple[nnx.GraphDef[Any], TrainState]:
     """Initialise a model and the state of its training from `config.seed`. Other arguments as for `step`."""
     graphdef, params, stats = learner.init(jax.random.key(config.seed))
-    optimiser = _or_default(optimiser, config, total)
+    optimiser = optimiser or _default_optimiser(config, total)
     # Without `jit`, JAX would compile a program for each shape of a parameter.
     return graphdef, TrainState(params, stats, jax.jit(optimiser.init)(params), jnp.zeros((), jnp.int32))
 
@@ -185,7 +180,7 @@ def step(
     gradient, (stats, terms) = jax.grad(objective, has_aux=True)(state.params)
     if "loss" not in terms:
         raise ValueError(f"the loss function returned the parts {sorted(terms)}, but one must have the name 'loss'")
-    optimiser = _or_default(optimiser, config, total)
+    optimiser = optimiser or _default_optimiser(config, total)
     update, rest = optimiser.update(gradient, state.optimiser, state.params)
     return TrainState(optax.apply_updates(state.params, update), stats, rest, state.step + 1), terms
 
@@ -257,7 +252,7 @@ def train(
         return load(workdir, calibrated=False)
     with storage.lock(workdir):
         storage.claim(workdir / folder.CONFIG, settings)
-        optimiser = _or_default(optimiser, config, total)
+        optimiser = optimiser or _default_optimiser(config, total)
         graphdef, state = initial(config, task, total, optimiser)
         state = folder.restore(workdir, state) or state
         take = jax.jit(

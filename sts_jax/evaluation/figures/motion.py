@@ -45,15 +45,9 @@ def outside(
     """Render the object and the pad from outside, obliquely from above.
 
     Args:
-        body: The object.
-        pose: Its pose.
         size: Size of the pad along x and y (m).
         up: Vector of any length that points upwards, in the sensor frame (default: the pad is level).
         wall: Height of the stop wall at the edge of the pad with the largest y (m). 0 draws no wall.
-        resolution: Height h and width w of the image (pixels).
-
-    Returns:
-        Image, sRGB in [0, 1].
     """
     half = jnp.stack([size[0], size[1], jnp.float32(_THICKNESS)]) / 2
     corners = jnp.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-2, 0)], jnp.float32)

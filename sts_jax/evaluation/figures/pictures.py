@@ -12,20 +12,14 @@ from sts_jax import physics
 from sts_jax.dataset import Pairs
 from sts_jax.evaluation.figures import drawing
 from sts_jax.evaluation.gap import Streams
-from sts_jax.evaluation.predictions import OUTCOMES, Predicted, in_unit, named
+from sts_jax.evaluation.predictions import Predicted, in_unit
 
 SAMPLES = 4  # number of samples that are shown for each prediction
 _PERCENTILE = 99.5  # percentile of the absolute differences at which their colour scale ends
 
 
 def predictions(
-    path: Path,
-    test: Pairs,
-    predicted: Predicted,
-    *,
-    num: int,
-    title: str,
-    scenario: physics.Scenario | None = None,
+    path: Path, test: Pairs, predicted: Predicted, *, num: int, title: str, scenario: physics.Scenario
 ) -> None:
     """Draw the first image, the true last image, the prediction and its samples for some held-out trajectories.
 
@@ -34,18 +28,14 @@ def predictions(
 
     Args:
         predicted: Predictions for all trajectories of `test`, or for the first ones.
-        scenario: The scenario, for the arrows and the names of the outcomes. None: no arrows, and the names of
-            `physics.Outcome`.
     """
     streams = [name for name in ("visual", "tactile") if getattr(predicted, name) is not None]
-    samples, outcomes = predicted.samples or Predicted(), OUTCOMES if scenario is None else scenario.outcomes
+    samples = predicted.samples or Predicted()
     num = min(num, *(len(getattr(predicted, name)) for name in streams))
     drawn = 0 if samples.visual is None and samples.tactile is None else SAMPLES
     heads = ["input", "truth", "mean of samples" if drawn else "prediction", *(f"sample {k + 1}" for k in range(drawn))]
     rows = len(streams) * num
-    drift = np.zeros((num, 2))
-    if scenario is not None:
-        drift = np.stack([scenario.drift(jnp.asarray(condition)) for condition in test.condition[:num]])
+    drift = np.stack([scenario.drift(jnp.asarray(condition)) for condition in test.condition[:num]])
     figure, axes = plt.subplots(rows, len(heads), figsize=(1.25 * len(heads) + 0.7, 1.25 * rows + 0.8), squeeze=False)
     for row in range(rows):
         item, stream = row // len(streams), streams[row % len(streams)]
@@ -61,8 +51,7 @@ def predictions(
                 axis.set_title(heads[column], fontsize=10)
         label = stream
         if row % len(streams) == 0:
-            outcome = named(int(test.outcome[item]), outcomes).replace("_", " ")
-            label = f"#{test.trajectory[item]}: {outcome}\n{stream}"
+            label = f"#{test.trajectory[item]}: {scenario.named(int(test.outcome[item]))}\n{stream}"
         axes[row, 0].set_ylabel(label, fontsize=9)
         if stream == streams[0] and drift[item].any():
             height, width = test.visual.shape[2:4]
