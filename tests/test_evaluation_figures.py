@@ -13,7 +13,7 @@ from test_evaluation_results import judged
 import sts_jax as sts
 from sts_jax import evaluation
 from sts_jax.evaluation import figures
-from sts_jax.evaluation.figures import drawing, motion
+from sts_jax.evaluation.figures import motion, pictures
 
 FRAMES = 5
 TIME = np.linspace(0, 1, FRAMES)
@@ -24,7 +24,7 @@ STREAMS = [np.full((FRAMES, size, size, 3), 0.5) for size in (16, 8, 8)]
 
 def test_a_strip_has_the_force_in_n_and_the_moment_in_mn_m(tmp_path, monkeypatch):
     drawn = []
-    monkeypatch.setattr(drawing, "save", lambda figure, path: drawn.append(figure))
+    monkeypatch.setattr(pictures, "save", lambda figure, path: drawn.append(figure))
     figures.strip(tmp_path / "a.png", TIME, *STREAMS, WRENCH, num=3)
     force, moment = drawn[0].axes[-2:]
     assert force.get_ylabel() == "force (N)"
@@ -61,7 +61,7 @@ def test_an_animation_draws_the_moment_below_the_force(tmp_path, sign):
 def drawn(monkeypatch):
     """The figures that are drawn, instead of files."""
     found = []
-    monkeypatch.setattr(drawing, "save", lambda figure, path: found.append(figure))
+    monkeypatch.setattr(pictures, "save", lambda figure, path: found.append(figure))
     yield found
     for figure in found:
         plt.close(figure)

@@ -28,19 +28,16 @@ class Measurement:
             raise ValueError(
                 f"name of a measurement is {self.name!r}: give a Python identifier other than {', '.join(NAMES)}"
             )
-        if (
-            not isinstance(self.shape, tuple)
-            or len(self.shape) not in (1, 3)
-            or not all(type(size) is int and size >= 1 for size in self.shape)
-        ):
+        if len(self.shape) not in (1, 3) or min(self.shape) < 1:
             raise ValueError(
                 f"measurement {self.name!r}: shape is {self.shape}, but it must be (size,) for a vector or (height, "
                 "width, channels) for an image"
             )
         for field in ("scale", "weight"):
-            value = getattr(self, field)
-            if not isinstance(value, int | float | np.number) or not 0 < value < np.inf:
-                raise ValueError(f"measurement {self.name!r}: {field} is {value}, but it must be > 0 and finite")
+            if not 0 < getattr(self, field) < np.inf:
+                raise ValueError(
+                    f"measurement {self.name!r}: {field} is {getattr(self, field)}, but it must be > 0 and finite"
+                )
         if self.is_image and self.scale != 1:
             raise ValueError(f"measurement {self.name!r}: scale is {self.scale}, but an image needs no scale")
 

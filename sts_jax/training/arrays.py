@@ -152,17 +152,13 @@ def image_arrays(
     preprocessing: Preprocessing,
     blank: UInt8[np.ndarray, "h w 3"],
 ) -> tuple[Arrays, Preprocessing]:
-    """Make the training arrays of an `mvae` model from images without poses, as from a real sensor.
+    """Make the training arrays of an `mvae` model as `frame_arrays`, from images without poses, as of a real sensor.
 
     Args:
-        visual: First and last visual images, for example from `hardware.Recordings.images`.
-        tactile: First and last tactile images.
+        visual: First and last images, for example from `hardware.Recordings.images`.
         modalities: Modalities of the model, one or both of `visual` and `tactile`.
         preprocessing: Detects contacts. For images of a camera, from `touch_of_noisy_images`.
         blank: Tactile image of the empty sensor.
-
-    Returns:
-        The arrays, and the preprocessing with a new value of `absent`, as from `frame_arrays`.
     """
     if blank.shape[:2] != preprocessing.resolution:
         raise ValueError(f"the images have {blank.shape[:2]} pixels: resize them to {preprocessing.resolution}")
@@ -314,7 +310,6 @@ def state_model(
 
     Args:
         pairs: The training trajectories. They and `empty` are as for `state_arrays`.
-        sensor: Sensor of the images.
         preprocessing: Its images must be square and show the whole view.
         image_size: Side of the predicted images (pixels), a divisor of the side of the input images.
 

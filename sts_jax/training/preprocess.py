@@ -122,8 +122,7 @@ def touch_of_noisy_images(
 ) -> Preprocessing:
     """Adapt the contact test `Preprocessing.touched` to the noise of a camera's images.
 
-    An image then shows a contact if at least three blocks of 2 x 2 pixels change by more than six standard deviations
-    of the noise in the mean of a block. A robust estimate of the noise ignores contacts on less than half of the pad.
+    At least three blocks of 2 x 2 pixels must change by more than six standard deviations of the noise in their mean.
 
     Args:
         preprocessing: Preprocessing whose other fields are kept.

@@ -11,7 +11,7 @@ from matplotlib.patches import Rectangle
 
 from sts_jax.evaluation import metrics
 from sts_jax.evaluation.catalogue import CALIBRATION, Scores
-from sts_jax.evaluation.figures import drawing
+from sts_jax.evaluation.figures import pictures
 
 _POSSIBLE, _PREDICTED = "tab:blue", "tab:orange"  # colours of simulated and of predicted last poses
 
@@ -78,7 +78,7 @@ def scaling(path: Path, points: Sequence[Trained], *, ceiling: float | None = No
     axes[1].set_xlabel("training time (minutes)")
     axes[0].set_ylabel("visual skill, held-out objects")
     figure.suptitle(title, fontsize=11)
-    drawing.save(figure, path)
+    pictures.save(figure, path)
 
 
 def training_curves(path: Path, logs: Mapping[str, Sequence[Mapping[str, float]]]) -> None:
@@ -109,7 +109,7 @@ def training_curves(path: Path, logs: Mapping[str, Sequence[Mapping[str, float]]
             axis.set_yscale("log")  # the loss is a sum over subsets, whose number differs between models
         axis.grid(alpha=0.3)
     axes[0, 0].legend(fontsize=7)
-    drawing.save(figure, path)
+    pictures.save(figure, path)
 
 
 def calibration(path: Path, scores: Mapping[str, Scores], *, title: str) -> None:
@@ -147,7 +147,7 @@ def calibration(path: Path, scores: Mapping[str, Scores], *, title: str) -> None
     axes[0, 0].set_ylim(0, 1.02)
     axes[1, 0].margins(y=0.2)
     figure.suptitle(title, fontsize=11)
-    drawing.save(figure, path)
+    pictures.save(figure, path)
 
 
 def ends(
@@ -192,4 +192,4 @@ def ends(
     model, name = axes[1].get_legend_handles_labels()
     figure.legend([*handles, model[-1]], [*labels, name[-1]], loc="outside lower center", ncols=4, fontsize=10)
     figure.suptitle(title, fontsize=11)
-    drawing.save(figure, path)
+    pictures.save(figure, path)

@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 from matplotlib.text import Annotation, Text
 
 from sts_jax import geometry, optics
-from sts_jax.evaluation.figures import drawing
+from sts_jax.evaluation.figures import pictures
 from sts_jax.objects import Body
 from sts_jax.storage import write_bytes
 
@@ -109,7 +109,7 @@ def strip(
     )
     for column, t in enumerate(chosen):
         for row, (name, images) in enumerate({"outside": view, "visual": visual, "tactile": tactile}.items()):
-            drawing.show(axes[row, column], images[t])
+            pictures.show(axes[row, column], images[t])
             if column == 0:
                 axes[row, column].set_ylabel(name, fontsize=8)
         axes[0, column].set_title(f"{time[t]:.2f} s", fontsize=8)
@@ -132,7 +132,7 @@ def strip(
     moment.set_xlabel("time (s)", fontsize=8)
     figure.align_ylabels([force, moment])
     figure.suptitle(title, fontsize=9)
-    drawing.save(figure, path)
+    pictures.save(figure, path)
 
 
 def animation(

@@ -1,4 +1,4 @@
-"""Figures of images in rows and columns. Each function writes one file."""
+"""Figures of images in rows and columns, and the functions that all figures use."""
 
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -7,15 +7,32 @@ from pathlib import Path
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 
 from sts_jax import physics
 from sts_jax.dataset import Pairs
-from sts_jax.evaluation.figures import drawing
 from sts_jax.evaluation.gap import Streams
 from sts_jax.evaluation.predictions import Predicted, in_unit
+from sts_jax.storage import write_whole
 
 SAMPLES = 4  # number of samples that are shown for each prediction
 _PERCENTILE = 99.5  # percentile of the absolute differences at which their colour scale ends
+
+
+def show(axis: Axes, image: np.ndarray) -> None:
+    """Draw an image with values in [0, 1], without ticks on the axes."""
+    axis.imshow(np.clip(image, 0, 1), interpolation="nearest")
+    axis.set_xticks([])
+    axis.set_yticks([])
+
+
+def save(figure: plt.Figure, path: Path) -> None:
+    """Write a figure as a PNG file, and close the figure."""
+    figure.set_layout_engine("constrained")
+    try:
+        write_whole(path, lambda temporary: figure.savefig(temporary, format="png", dpi=130))
+    finally:
+        plt.close(figure)
 
 
 def predictions(
@@ -44,7 +61,7 @@ def predictions(
         pictures += [] if drawings is None else list(drawings[:SAMPLES, item])
         for column, axis in enumerate(axes[row]):
             if column < len(pictures):
-                drawing.show(axis, in_unit(pictures[column]))
+                show(axis, in_unit(pictures[column]))
             else:
                 axis.axis("off")
             if row == 0:
@@ -61,7 +78,7 @@ def predictions(
     arrows = "\nred arrow: velocity over the pad that a freely sliding object receives" if drift.any() else ""
     wrapped = textwrap.fill(title, int(11 * figure.get_figwidth()))  # about eleven letters fit into an inch
     figure.suptitle(wrapped + arrows, fontsize=11)
-    drawing.save(figure, path)
+    save(figure, path)
 
 
 def comparison(
@@ -83,12 +100,12 @@ def comparison(
         for column, (name, images) in enumerate(group.items()):
             axes[0, column].set_title(name, fontsize=9)
             for row in range(rows):
-                drawing.show(axes[row, column], images[row])
+                show(axes[row, column], images[row])
         if number == 0:
             for row, label in enumerate(labels):
                 axes[row, 0].set_ylabel(label, fontsize=9)
     figure.suptitle(title, fontsize=11)
-    drawing.save(figure, path)
+    save(figure, path)
 
 
 def side_by_side(
@@ -119,8 +136,8 @@ def side_by_side(
         difference = (first.astype(np.float64) - second).mean(-1)
         reach = max(float(np.percentile(np.abs(difference), _PERCENTILE)), 1.0)
         for row in range(rows):
-            drawing.show(axes[row, 0], first[row] / 255)
-            drawing.show(axes[row, 1], second[row] / 255)
+            show(axes[row, 0], first[row] / 255)
+            show(axes[row, 1], second[row] / 255)
             if matched:
                 drawn = axes[row, 2].imshow(difference[row], cmap="RdBu_r", vmin=-reach, vmax=reach)
                 axes[row, 2].set_xticks([])
@@ -134,4 +151,4 @@ def side_by_side(
     for axis, label in zip(grid[:, 0], labels, strict=True):
         axis.set_ylabel(label, fontsize=9)
     figure.suptitle(title, fontsize=11)
-    drawing.save(figure, path)
+    save(figure, path)
