@@ -8,13 +8,15 @@ a share of the training objects (`--shares`) with the largest number of `--steps
 with each number of `--steps`. It prints the errors for the held-out objects, and plots the visual skill to `--out`.
 """
 
+import collections
 import dataclasses
 import itertools
 import time
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Literal, NamedTuple, TypeVar
 
 import jax
+import matplotlib.pyplot as plt
 import numpy as np
 import tyro
 
@@ -24,7 +26,6 @@ from experiments.shared import run
 from experiments.shared.config import Config
 from experiments.shared.terminal import say
 from sts_jax import dataset, evaluation, storage
-from sts_jax.evaluation.figures import Trained, scaling
 
 Part = TypeVar("Part", dataset.Pairs, dataset.Views, dataset.Ends)
 SUBSETS = (("visual", "pose"), ("visual",))
@@ -75,13 +76,38 @@ def train(
     return len(falls.object), storage.read_json(note, f"delete {folder}") / 60
 
 
-def best_possible(workdir: Path) -> float | None:
-    """Read the skill of the best possible prediction of visual images from `metrics.json` in a work directory."""
-    path = workdir / "metrics.json"
-    if not path.exists():
-        return None
-    found = storage.read_json(path, f"delete {path} and evaluate again")["predictors"].get(evaluation.CEILING)
-    return None if found is None else found["visual_skill"]["value"]
+class Trained(NamedTuple):
+    """A trained model."""
+
+    name: str  # its inputs
+    trajectories: int  # number of training trajectories
+    steps: int  # number of gradient steps
+    minutes: float  # training time
+
+
+def plot(path: Path, models: dict[Trained, dict[str, float]], best: float | None, title: str) -> None:
+    """Draw the visual skill, with its interval, over the number of trajectories and over the training time."""
+    figure, axes = plt.subplots(1, 2, figsize=(10.5, 4.8), sharey=True, layout="constrained")
+    for axis, along, fixed in ((axes[0], "trajectories", "steps"), (axes[1], "minutes", "trajectories")):
+        lines = collections.defaultdict(list)
+        for model in sorted(models, key=lambda model: getattr(model, along)):
+            lines[model.name, getattr(model, fixed)].append(model)
+        trends = {name for (name, _), line in lines.items() if len(line) > 1}
+        for (name, number), line in lines.items():
+            if len(line) > 1 or name not in trends:
+                skill, low, high = (np.array([models[one][key] for one in line]) for key in ("value", "low", "high"))
+                place = [getattr(one, along) for one in line]
+                label = f"{name}, {number:,} {fixed}"
+                axis.errorbar(place, skill, [skill - low, high - skill], fmt="o-", capsize=3, label=label)
+        if best is not None:
+            axis.axhline(best, color="gray", linestyle="--", label="ceiling (re-rolls)")
+        axis.set_xscale("log")
+        axis.set_xlabel(f"training {along}")
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize=9)
+    axes[0].set_ylabel("visual skill, held-out objects")
+    figure.suptitle(title, fontsize=11)
+    figure.savefig(path, dpi=130)
 
 
 def main(args: Args) -> str:
@@ -106,17 +132,16 @@ def main(args: Args) -> str:
                 say(title)
                 found = evaluation.predict(predictor, subset, given, scenario, num_samples=config.num_samples)
                 scores[title] = judge(found, test)
-                points[title] = (" and ".join(subset), trajectories, steps, round(minutes, 1))
+                points[title] = Trained(" and ".join(subset), trajectories, steps, round(minutes, 1))
     summary = evaluation.summarise(scores, test, outcomes=scenario.outcomes)
     skills = {title: summary["predictors"][title]["visual_skill"] for title in points}
-    trained = [
-        Trained(*points[title], skill["value"], skill["low"], skill["high"])
-        for title, skill in skills.items()
-        if title.endswith(f"seed {args.seeds[0]}")
-    ]
-    title = f"{args.workdir.name}: visual skill of the state-space model"
-    scaling(args.out, trained, ceiling=best_possible(args.workdir), title=title)
-    notes = [f"{title}: {minutes} minutes of training" for title, (*_, minutes) in points.items()]
+    shown = {points[title]: skill for title, skill in skills.items() if title.endswith(f"seed {args.seeds[0]}")}
+    title, metrics = f"{args.workdir.name}: visual skill of the state-space model", args.workdir / "metrics.json"
+    best = None
+    if metrics.exists():
+        best = storage.read_json(metrics, "evaluate again")["predictors"][evaluation.CEILING]["visual_skill"]["value"]
+    plot(args.out, shown, best, title)
+    notes = [f"{title}: {model.minutes} minutes of training" for title, model in points.items()]
     return evaluation.table(summary, title=f"{args.workdir.name}: scaling", rows=list(points), notes=notes)
 
 

@@ -22,9 +22,17 @@ WRENCH[:, 3] = 0.02 * TIME  # N m
 STREAMS = [np.full((FRAMES, size, size, 3), 0.5) for size in (16, 8, 8)]
 
 
-def test_a_strip_has_the_force_in_n_and_the_moment_in_mn_m(tmp_path, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(pictures, "save", lambda figure, path: drawn.append(figure))
+@pytest.fixture
+def drawn(monkeypatch):
+    """The figures that are drawn, instead of files."""
+    found = []
+    monkeypatch.setattr(pictures, "save", lambda figure, path: found.append(figure))
+    yield found
+    for figure in found:
+        plt.close(figure)
+
+
+def test_a_strip_has_the_force_in_n_and_the_moment_in_mn_m(tmp_path, drawn):
     figures.strip(tmp_path / "a.png", TIME, *STREAMS, WRENCH, num=3)
     force, moment = drawn[0].axes[-2:]
     assert force.get_ylabel() == "force (N)"
@@ -55,16 +63,6 @@ def test_an_animation_draws_the_moment_below_the_force(tmp_path, sign):
     assert np.ptp(blue_rows(pages[-1], 1)) > 60  # from 0 to 20 mN m
     assert 10 < np.ptp(blue_rows(pages[2], 1)) < 50  # halfway
     assert not len(blue_rows(pages[-1], 0))  # no force: the three curves lie on each other, the last one is on top
-
-
-@pytest.fixture
-def drawn(monkeypatch):
-    """The figures that are drawn, instead of files."""
-    found = []
-    monkeypatch.setattr(pictures, "save", lambda figure, path: found.append(figure))
-    yield found
-    for figure in found:
-        plt.close(figure)
 
 
 def test_predictions_show_input_truth_mean_and_four_samples_of_both_streams(tmp_path, drawn):
@@ -114,31 +112,6 @@ def test_ends_are_drawn_in_millimetres_as_the_images_are_oriented(tmp_path, draw
         np.testing.assert_allclose([first.get_xdata()[0], first.get_ydata()[0]], [10, -20])
         np.testing.assert_allclose([true.get_xdata()[0], true.get_ydata()[0]], [30, 40])
         np.testing.assert_allclose(np.transpose([ends.get_xdata(), ends.get_ydata()]), 1e3 * poses[:, :2])
-
-
-def test_a_scaling_figure_joins_models_of_one_number_of_steps_or_of_trajectories(tmp_path, drawn):
-    points = [
-        figures.Trained("vision", number, 100 * minutes, minutes + number / 1e4, number * minutes / 1e4, 0.0, 1.0)
-        for number in (800, 100)
-        for minutes in (5, 2)
-    ]
-    figures.scaling(tmp_path / "a.png", points, ceiling=0.8, title="t")
-    left, right = drawn[0].axes
-
-    def lines(axis):
-        handles, labels = axis.get_legend_handles_labels()
-        return {label: handle.lines[0].get_xydata().tolist() for handle, label in zip(handles, labels, strict=True)}
-
-    assert lines(left) == {
-        "vision, 500 steps": [[100, 0.05], [800, 0.4]],
-        "vision, 200 steps": [[100, 0.02], [800, 0.16]],
-    }
-    assert lines(right) == {
-        "vision, 800 trajectories": [[2.08, 0.16], [5.08, 0.4]],
-        "vision, 100 trajectories": [[2.01, 0.02], [5.01, 0.05]],
-    }
-    assert left.get_xticks().tolist() == [100, 800]
-    assert right.get_xticks().tolist() == [2.01, 2.08, 5.01, 5.08]
 
 
 @pytest.mark.parametrize(("last", "scale"), [(0.5, "log"), (-3.0, "linear")])

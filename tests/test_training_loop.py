@@ -44,14 +44,7 @@ def test_a_killed_run_ends_with_the_same_bits(tmp_path, finished, step):
     same(model.state, finished[1].state)
     for name in ("metrics.jsonl", "config.json"):
         assert (tmp_path / name).read_text() == (finished[0] / name).read_text()
-    assert [json.loads(line)["step"] for line in (tmp_path / "metrics.jsonl").read_text().splitlines()] == [
-        2,
-        4,
-        6,
-        8,
-        10,
-        12,
-    ]
+    assert [record["step"] for record in training.records(tmp_path)] == [2, 4, 6, 8, 10, 12]
 
 
 def test_a_finished_run_is_not_changed(finished):

@@ -1,9 +1,7 @@
 """Figures of predictions, training and simulation. Each function writes one file."""
 
-from sts_jax.evaluation.figures.curves import Trained as Trained
 from sts_jax.evaluation.figures.curves import calibration as calibration
 from sts_jax.evaluation.figures.curves import ends as ends
-from sts_jax.evaluation.figures.curves import scaling as scaling
 from sts_jax.evaluation.figures.curves import training_curves as training_curves
 from sts_jax.evaluation.figures.motion import SLOWER as SLOWER
 from sts_jax.evaluation.figures.motion import animation as animation

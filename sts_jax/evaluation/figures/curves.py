@@ -1,9 +1,7 @@
-"""Figures of numbers: training, scaling, calibration and last positions. Each function writes one file."""
+"""Figures of numbers: training, calibration and last positions. Each function writes one file."""
 
-import collections
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -14,71 +12,6 @@ from sts_jax.evaluation.catalogue import CALIBRATION, Scores
 from sts_jax.evaluation.figures import pictures
 
 _POSSIBLE, _PREDICTED = "tab:blue", "tab:orange"  # colours of simulated and of predicted last poses
-
-
-class Trained(NamedTuple):
-    """One trained model, a point in the figure of `scaling`."""
-
-    name: str  # name of the curve in the legend, such as the inputs of the model
-    trajectories: int  # number of training trajectories
-    steps: int  # number of gradient steps
-    minutes: float  # training time (minutes)
-    skill: float  # visual skill on held-out objects
-    low: float  # lower limit of the 95 % interval of the skill
-    high: float  # upper limit of the 95 % interval of the skill
-
-
-def scaling(path: Path, points: Sequence[Trained], *, ceiling: float | None = None, title: str) -> None:
-    """Draw the visual skill of trained models over the number of training trajectories and over the training time.
-
-    In the left panel, a line connects models with the same name and number of steps, and in the right panel those with
-    the same name and number of trajectories.
-
-    Args:
-        points: The trained models.
-        ceiling: Skill of the best possible prediction, drawn as a horizontal line. None draws no line.
-    """
-    figure, axes = plt.subplots(1, 2, figsize=(10.5, 4.8), sharey=True)
-    for axis, along, fixed, unit in (
-        (axes[0], "trajectories", "steps", "{:,} steps"),
-        (axes[1], "minutes", "trajectories", "{:,} trajectories"),
-    ):
-        groups = collections.Counter((point.name, getattr(point, fixed)) for point in points)
-        sizes = [(name, count) for (name, _), count in groups.items()]
-        ticks: set[float] = set()
-        for group in groups:
-            own = [point for point in points if (point.name, getattr(point, fixed)) == group]
-            own = sorted(own, key=lambda point: getattr(point, along))
-            if len(own) < 2 and any(count > 1 for name, count in sizes if name == group[0]):
-                continue  # a single point shows no trend, and another line of the same name does
-            skill = np.array([point.skill for point in own])
-            spread = [skill - [point.low for point in own], [point.high for point in own] - skill]
-            label = f"{group[0]}, {unit.format(group[1])}"
-            place = [getattr(point, along) for point in own]
-            ticks.update(place)
-            axis.errorbar(place, skill, spread, fmt="o-", capsize=3, markersize=5, linewidth=1.2, label=label)
-        if ceiling is not None:
-            axis.axhline(ceiling, color="gray", linestyle="--", linewidth=1)
-            axis.annotate(
-                "ceiling (re-rolls)",
-                (0.02, ceiling),
-                (0, 3),
-                xycoords=("axes fraction", "data"),
-                textcoords="offset points",
-                fontsize=9,
-                color="0.4",
-            )
-        axis.set_xscale("log")
-        axis.set_xticks(sorted(ticks), [f"{tick:,g}" for tick in sorted(ticks)])
-        axis.set_xticks([], minor=True)
-        axis.grid(alpha=0.3)
-        axis.margins(y=0.12)
-        axis.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2)
-    axes[0].set_xlabel("training trajectories")
-    axes[1].set_xlabel("training time (minutes)")
-    axes[0].set_ylabel("visual skill, held-out objects")
-    figure.suptitle(title, fontsize=11)
-    pictures.save(figure, path)
 
 
 def training_curves(path: Path, logs: Mapping[str, Sequence[Mapping[str, float]]]) -> None:
