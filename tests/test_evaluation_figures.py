@@ -87,17 +87,6 @@ def test_predictions_show_input_truth_mean_and_four_samples_of_both_streams(tmp_
     np.testing.assert_allclose(picture(2, 6), predicted.samples.visual[3, 1] / 255, rtol=1e-6)
 
 
-def test_a_calibration_figure_shows_shares_and_counts_of_each_bin(tmp_path, drawn):
-    confidence, right = np.array([0.91, 0.95, 0.93, 0.55]), np.array([True, True, False, True])
-    by_name = {"deterministic": {}, "from vision": {evaluation.CALIBRATION: np.stack([confidence, right], 1)}}
-    figures.calibration(tmp_path / "a.png", by_name, title="t")
-    above, below = drawn[0].axes
-    (points,) = [line for line in above.lines if line.get_marker() == "o"]
-    np.testing.assert_allclose(points.get_xdata(), [0.55, 0.93])
-    np.testing.assert_allclose(points.get_ydata(), [1, 2 / 3])
-    assert [text.get_text() for text in below.texts if text.get_text()] == ["1", "3"]
-
-
 def test_ends_are_drawn_in_millimetres_as_the_images_are_oriented(tmp_path, drawn):
     start, truth = np.array([0.01, -0.02, 0.1, 1, 0, 0, 0]), np.array([0.03, 0.04, 0.02, 1, 0, 0, 0])
     rerolled, sampled = (np.tile(truth, (k, 1)) for k in (16, 4))

@@ -170,16 +170,8 @@ def test_every_reroll_begins_at_the_start_of_its_item_and_its_end_is_a_sample(en
     assert found.outcome.tolist() == [physics.Outcome.RESTS] * 3
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: evaluation.ceiling(COLLECTION, sts.Sensor(), starts(), 0, jax.random.key(0)), "times must be >= 1"),
-        (
-            lambda: evaluation.predict(Echo(), ("visual",), starts().take(slice(0)), physics.Freefall()),
-            "`test` has 0 trajectories: choose",
-        ),
-    ],
-)
-def test_bad_calls_are_refused(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()
+def test_bad_calls_are_refused():
+    with pytest.raises(ValueError, match="times must be >= 1"):
+        evaluation.ceiling(COLLECTION, sts.Sensor(), starts(), 0, jax.random.key(0))
+    with pytest.raises(ValueError, match="`test` has 0 trajectories: choose"):
+        evaluation.predict(Echo(), ("visual",), starts().take(slice(0)), physics.Freefall())

@@ -81,20 +81,20 @@ def test_noise_bright_pixels_and_a_change_of_the_light_are_no_touch_and_a_faint_
     assert training.Preprocessing.from_json(dataclasses.asdict(own)) == own
 
 
-def test_images_of_another_resolution_and_invalid_fields_are_refused():
-    small = np.zeros((2, 32, 32, 3), np.uint8)
-    with pytest.raises(TypeCheckError, match="blank"):
-        training.touch_of_noisy_images(training.Preprocessing(), small, BLANK)
-    with pytest.raises(ValueError, match=r"of \(32, 32\) pixels: give at least one"):
-        training.touch_of_noisy_images(training.Preprocessing(), small, small[0])
-    with pytest.raises(ValueError, match="touch_block must divide"):
-        training.Preprocessing(touch_block=3)
-    with pytest.raises(ValueError, match="resolution is missing"):
-        training.Preprocessing.from_json({})
+SMALL = np.zeros((2, 32, 32, 3), np.uint8)
 
 
-def test_an_unknown_rotation_or_modality_is_named():
-    with pytest.raises((ValueError, TypeCheckError), match="rotation"):  # tests check all annotations first
-        training.Preprocessing(rotation="euler")
-    with pytest.raises(ValueError, match="modalities must be some of visual, tactile, pose, got 'visal'"):
-        training.paper_model(("visal",), training.Preprocessing())
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: training.touch_of_noisy_images(training.Preprocessing(), SMALL, BLANK), "blank"),
+        (lambda: training.touch_of_noisy_images(training.Preprocessing(), SMALL, SMALL[0]), r"\(32, 32\) pixels: give"),
+        (lambda: training.Preprocessing(touch_block=3), "touch_block must divide"),
+        (lambda: training.Preprocessing.from_json({}), "resolution is missing"),
+        (lambda: training.Preprocessing(rotation="euler"), "rotation"),
+        (lambda: training.paper_model(("visal",), training.Preprocessing()), "tactile, pose, got 'visal'"),
+    ],
+)
+def test_bad_calls_are_refused(call, message):
+    with pytest.raises((ValueError, TypeCheckError), match=message):  # tests check all annotations first
+        call()

@@ -51,7 +51,7 @@ def render(
         Batches in the order of storage: visual images, tactile images and segmentations, or visual images of views.
     """
     size = frames_per_call()
-    quat, wrench = geometry.quat_canonical(trajectory.pose[..., 3:]), trajectory.wrench
+    quat, wrench = geometry.quat_canonical(trajectory.pose[..., 3:]), np.asarray(trajectory.wrench)
     pose = np.concatenate([trajectory.pose[..., :3], quat], -1)
 
     def jobs() -> Iterator[_Job]:
