@@ -70,6 +70,17 @@ def kill_at(step):
     return progress
 
 
+def unit(angle):
+    """Cosine and sine of angles."""
+    angle = jnp.asarray(angle, jnp.float32)
+    return jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+
+
+def finite(tree):
+    """Assert that a tree has only finite numbers."""
+    jax.tree.map(lambda leaf: np.testing.assert_array_equal(np.isfinite(leaf), True), tree)
+
+
 def same(a, b):
     """Assert that two trees have the same bits."""
     jax.tree.map(np.testing.assert_array_equal, a, b)

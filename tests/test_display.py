@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from damage import damaged
 from optics_bodies import noise
 from PIL import Image
 
@@ -44,28 +45,22 @@ def test_a_loaded_npz_equals_the_saved_object(tmp_path, thing):
 
 
 def test_a_damaged_file_raises_an_error_unless_the_damage_is_outside_the_arrays(tmp_path):
-    path = tmp_path / "frame.npz"
+    path, refused = tmp_path / "frame.npz", 0
     sts.save(path, FRAME)
-    whole = path.read_bytes()
-    refused = 0
-    for position in range(0, len(whole), 37):
-        path.write_bytes(whole[:position] + bytes([whole[position] ^ 16]) + whole[position + 1 :])
+    for damage in damaged(path, flips=60):
         try:
             same(sts.load(path), FRAME)
         except DamagedFileError:
             refused += 1
+        except FileNotFoundError:
+            assert damage == "missing"
     assert refused > 20
-    path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(DamagedFileError, match=r"frame\.npz is damaged or was not written by this version"):
-        sts.load(path)
 
 
 def test_a_file_of_another_format_raises_an_error(tmp_path):
     np.savez(tmp_path / "x.npz", kind=np.array("Frame"), format=np.array(99))
-    with pytest.raises(DamagedFileError, match="format 99"):
+    with pytest.raises(DamagedFileError, match=r"x\.npz is damaged or was not written by this version.*format 99"):
         sts.load(tmp_path / "x.npz")
-    with pytest.raises(FileNotFoundError, match="no such file"):
-        sts.load(tmp_path / "none.npz")
     for path in (tmp_path, tmp_path / "x.png"):
         path.touch()
         with pytest.raises(ValueError, match=r"must be an \.npz file that sts\.save wrote"):
@@ -88,9 +83,8 @@ def test_a_figure_has_the_panels_of_its_object(thing, panels):
     assert figure.get_suptitle() == "title"
     with Image.open(io.BytesIO(figure._repr_png_())) as picture:  # for a notebook
         assert np.asarray(picture.convert("L")).std() > 1
-    first = figure.axes[0].images[0].get_array()
-    expected = thing.visual if hasattr(thing, "visual") else thing
-    np.testing.assert_allclose(first, np.asarray(expected) / (255 if np.asarray(expected).dtype == np.uint8 else 1))
+    image = np.asarray(getattr(thing, "visual", thing))
+    np.testing.assert_allclose(figure.axes[0].images[0].get_array(), image / (255 if image.dtype == np.uint8 else 1))
 
 
 def test_a_body_is_drawn_from_outside():

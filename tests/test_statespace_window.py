@@ -11,12 +11,12 @@ from sts_jax import objects, physics
 from sts_jax.statespace import window
 
 SIZE = 64
+PLACE = (np.arange(SIZE) + 0.5) / SIZE
 
 
-def rectangle(centre, angle, extent, size=SIZE):
-    """An image `(size, size, 3)` of a turned rectangle. Lengths are shares of the side, and the angle is in radians."""
-    place = (np.arange(size) + 0.5) / size
-    x, y = np.meshgrid(place - centre[0], place - centre[1])
+def rectangle(centre, angle, extent):
+    """An image of a turned rectangle. Lengths are shares of the side, and the angle is in radians."""
+    x, y = np.meshgrid(PLACE - centre[0], PLACE - centre[1])
     along, across = np.cos(angle) * x + np.sin(angle) * y, np.cos(angle) * y - np.sin(angle) * x
     inside = (np.abs(along) < extent[0] / 2) & (np.abs(across) < extent[1] / 2)
     return np.repeat(inside[..., None], 3, axis=-1).astype(np.float32) * 0.5
@@ -44,8 +44,7 @@ def test_window_of_an_unchanged_image_is_the_whole_image():
 def test_image_and_turned_image_have_the_same_cut():
     change = rectangle((0.4, 0.6), -0.9, (0.5, 0.2))
     change *= np.random.default_rng(0).uniform(0.2, 1, change.shape).astype(np.float32)  # no symmetry
-    turned = np.rot90(change, -1).copy()  # from columns to rows, by +90 degrees because rows count downwards
-    both = jnp.stack([change, turned])
+    both = jnp.stack([change, np.rot90(change, -1)])  # by +90 degrees because rows count downwards
     found = window.locate(both)
     np.testing.assert_allclose(found.angle[1], [-found.angle[0, 1], found.angle[0, 0]], atol=1e-4)
     cut = window.cut(both, found, 16)
@@ -54,8 +53,7 @@ def test_image_and_turned_image_have_the_same_cut():
 
 
 def test_cut_of_a_gradient_is_the_gradient_along_the_window():
-    place = (np.arange(SIZE) + 0.5) / SIZE
-    column, row = np.meshgrid(place, place)
+    column, row = np.meshgrid(PLACE, PLACE)
     image = (0.2 * column + 0.5 * row)[None, :, :, None].astype(np.float32)
     cos, sin = np.cos(0.4), np.sin(0.4)
     square = window.Window(jnp.array([[0.5, 0.45]]), jnp.array([[cos, sin]], jnp.float32), jnp.array([0.4]))
@@ -70,11 +68,10 @@ def test_sample_equals_scipy_and_is_zero_outside():
     places = rng.uniform(-3, 10, (2, 200, 2)).astype(np.float32)
     places[:, :4] = [[7, 7], [8, 8], [-1, 3], [1e4, -1e4]]
     found = window.sample(jnp.asarray(images), jnp.asarray(places))
-    for image, place, own in zip(images, places, found, strict=True):
-        for channel in range(3):
-            padded = np.pad(image[..., channel], 1)
-            expected = ndimage.map_coordinates(padded, place.T[::-1] + 1, order=1, mode="constant")
-            np.testing.assert_allclose(own[:, channel], expected, atol=1e-5)
+    for i, c in np.ndindex(2, 3):
+        padded = np.pad(images[i, ..., c], 1)
+        expected = ndimage.map_coordinates(padded, places[i].T[::-1] + 1, order=1, mode="constant")
+        np.testing.assert_allclose(found[i, :, c], expected, atol=1e-5)
     outside = ((places <= -1) | (places >= 8)).any(-1)
     np.testing.assert_array_equal(np.asarray(found)[outside], 0)
 
@@ -88,7 +85,6 @@ def test_shows_includes_the_object_and_excludes_its_shadow(category):
     away = sts.sense(sensor, body, pose.at[2].add(1e3), resolution=(SIZE, SIZE))
     shown = np.asarray(window.shows((resting.visual - away.visual)[None]))[0] > 0
     mask = np.asarray(resting.segmentation) > 0
-    assert mask.mean() > 0.01
     assert (mask & ~shown).sum() < 0.05 * mask.sum()
     faintly = np.abs(resting.visual - away.visual).max(-1) > 4 / 255
     shadow = (faintly & ~mask).sum()
