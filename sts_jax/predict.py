@@ -76,17 +76,12 @@ class Predictor:
         self._empty = dict(zip(("visual", "tactile"), images, strict=True))
 
     @classmethod
-    def load(
-        cls, folder: str | Path, *, resolution: tuple[int, int] | None = None, crop: bool | None = None
-    ) -> "Predictor":
+    def load(cls, folder: str | Path) -> "Predictor":
         """Load a trained model, after comparing its files with their checksums.
 
         Args:
             folder: Folder of a model, or the name of a model that comes with the library, such as `freefall`. A folder
                 of this name in the current directory that contains `config.json` comes first.
-            resolution: Height and width of the images that you will pass (pixels). Another model is refused.
-            crop: View of the images that you will pass: True for the square around the object, False for the whole pad.
-                Another model is refused.
         """
         path = _located(folder)
         model = training.load(path)
@@ -97,16 +92,14 @@ class Predictor:
                 f"the field 'preprocessing' of {path / 'config.json'} is not valid: {error}. Train the model with "
                 "training.train(..., preprocessing=dataclasses.asdict(p)), where p is a training.Preprocessing."
             ) from error
-        needed: dict[str, Any] = {"resolution": resolution and tuple(resolution), "crop": crop}
-        _compare(str(folder), preprocessing, {name: value for name, value in needed.items() if value is not None})
         if isinstance(model.config, statespace.Config):
-            size = (model.config.input_size,) * 2
-            scale = model.config.position_scale
-            _compare(
-                f"the networks of {folder}",
-                preprocessing,
-                {"resolution": size, "crop": False, "rotation": "matrix", "position_scale": scale},
-            )
+            size, scale = (model.config.input_size,) * 2, model.config.position_scale
+            needed = {"resolution": size, "crop": False, "rotation": "matrix", "position_scale": scale}
+            for field, value in needed.items():
+                if (trained := getattr(preprocessing, field)) != value:
+                    raise ValueError(
+                        f"{folder} was trained with {field}={trained!r}, but its networks need {value!r}: train again"
+                    )
         blank = training.load_blank(path)
         if any(image.shape[:2] != preprocessing.resolution for image in blank):
             raise ValueError(
@@ -219,8 +212,8 @@ class Predictor:
         condition, fine = self._condition(condition, lead)
         graphdef, state = model.graphdef, model.state
         if isinstance(model.config, mvae.Config):
-            blank, shape = self._empty["tactile"], () if inputs else lead
-            result = predict(graphdef, state, view, blank, inputs, present, condition, key, num_samples, shape)
+            more = condition, key, num_samples, lead
+            result = predict(graphdef, state, view, self._empty["tactile"], inputs, present, *more)
         else:
             inputs, present = completed(self._inputs, view.resolution, inputs, present, lead)
             more = condition, key, num_samples, lead, model.calibration
@@ -353,14 +346,3 @@ def _located(folder: str | Path) -> Path:
             f"({', '.join(names) or 'none'}): give one of these names, or the folder of a trained model."
         )
     return MODELS / name
-
-
-def _compare(name: str, preprocessing: training.Preprocessing, needed: dict[str, Any]) -> None:
-    """Raise a ValueError if a field of the preprocessing has another value than needed."""
-    for field, value in needed.items():
-        trained = getattr(preprocessing, field)
-        if trained != value:
-            raise ValueError(
-                f"{name} was trained with {field}={trained!r}, but {field}={value!r} is needed: use images with "
-                f"{field}={trained!r}, or train a model with {field}={value!r}."
-            )

@@ -44,7 +44,7 @@ class Prediction(NamedTuple):
         return f"Prediction({', '.join(shapes)})"
 
 
-@functools.partial(jax.jit, static_argnames=("graphdef", "preprocessing", "num_samples", "shape"))
+@functools.partial(jax.jit, static_argnames=("graphdef", "preprocessing", "num_samples", "lead"))
 def predict(
     graphdef: nnx.GraphDef,
     state: nnx.State,
@@ -55,7 +55,7 @@ def predict(
     condition: Float[Array, "..."] | None = None,
     key: PRNGKeyArray | None = None,
     num_samples: int = 0,
-    shape: tuple[int, ...] = (),
+    lead: tuple[int, ...] = (),
 ) -> Prediction:
     """Predict with a multimodal variational autoencoder: decode the mean of the posterior, given the inputs.
 
@@ -67,17 +67,13 @@ def predict(
         condition: Conditions in SI units, (*n, c), or None.
         key: Random key for the samples. If it is None, no samples are drawn.
         num_samples: Number of samples to draw from the posterior and to decode.
-        shape: Leading axes of the prediction if `inputs` is empty. The prediction is then made from the prior.
+        lead: Leading axes *n. Without inputs, the prediction is made from the prior.
     """
-    lead = shape
-    vectors = ("pose", *dict(preprocessing.scales))
-    for name, value in inputs.items():
-        lead = value.shape[: -1 if name in vectors else -3]
     flat, counts = _flat(preprocessing, inputs, present, lead, blank)
     if flat:
         posterior = mvae.infer(graphdef, state, flat, present=counts)
     else:
-        nothing = jnp.zeros((math.prod(shape), nnx.merge(graphdef, state).config.latent))
+        nothing = jnp.zeros((math.prod(lead), nnx.merge(graphdef, state).config.latent))
         posterior = mvae.Gaussian(nothing, nothing)
     if condition is not None:
         condition = preprocessing.encode_condition(condition).reshape(-1, condition.shape[-1])
@@ -104,7 +100,7 @@ def predict(
     return result
 
 
-@functools.partial(jax.jit, static_argnames=("graphdef", "preprocessing", "num_samples", "shape"))
+@functools.partial(jax.jit, static_argnames=("graphdef", "preprocessing", "num_samples", "lead"))
 def predict_samples(
     graphdef: nnx.GraphDef,
     state: nnx.State,
@@ -115,7 +111,7 @@ def predict_samples(
     condition: Float[Array, "..."] | None = None,
     key: PRNGKeyArray | None = None,
     num_samples: int = 0,
-    shape: tuple[int, ...] = (),
+    lead: tuple[int, ...] = (),
     calibration: statespace.Calibration | None = None,
 ) -> Prediction:
     """Predict with a state-space model, which draws samples of the final pose and of the images.
@@ -125,40 +121,36 @@ def predict_samples(
     with the smallest mean distance (in position and angle) from the other samples.
 
     Args:
-        preprocessing: Preprocessing with which the model was trained.
         empty: Images "visual" and "tactile" of the empty sensor in [0, 1].
         inputs: All inputs of the model by name, see `completed`, and optionally the state codes "state".
-        present: Masks (*n,) by name. An input without a mask is used for all items.
-        condition: Conditions in SI units, (*n, c), or None.
         key: Random key for the samples. None stands for `jax.random.key(0)`, so that every call gives the same result.
-        num_samples: Number of samples to return in `Prediction.samples`.
-        shape: Leading axes *n of the inputs and the prediction.
         calibration: From `statespace.fit_calibration`. None for no correction and the default contrast.
+
+    The other arguments are those of `predict`.
     """
-    lead = shape
     flat, counts = _flat(preprocessing, inputs, present, lead, empty["tactile"])
     if condition is not None:
         condition = preprocessing.encode_condition(condition).reshape(-1, condition.shape[-1])
     drawn = num_samples or _DRAWN
     key = jax.random.key(0) if key is None else key
-    drawn_samples = statespace.sample(
+    samples = statespace.sample(
         graphdef, state, key, flat, counts, empty, condition, calibration, num=max(_POSES, drawn), drawn=drawn
     )
-    poses = preprocessing.decode_pose(drawn_samples.pose)
-    images = {name: x.reshape(drawn, *lead, *x.shape[2:]) for name, x in drawn_samples.images.items()}
-    mean, log_var = (x.reshape(*lead, -1) for x in drawn_samples.belief)
+    poses = preprocessing.decode_pose(samples.pose)
+    mean, log_var = (x.reshape(*lead, -1) for x in samples.belief)
     result = Prediction(
-        visual=drawn_samples.mean["visual"].reshape(*lead, *drawn_samples.mean["visual"].shape[1:]),
-        tactile=drawn_samples.mean["tactile"].reshape(*lead, *drawn_samples.mean["tactile"].shape[1:]),
+        visual=samples.mean["visual"].reshape(*lead, *samples.mean["visual"].shape[1:]),
+        tactile=samples.mean["tactile"].reshape(*lead, *samples.mean["tactile"].shape[1:]),
         pose=_central(poses).reshape(*lead, 7),
         mean=mean,
         log_var=log_var,
-        outcome_probability=drawn_samples.outcome.reshape(*lead, -1),
+        outcome_probability=samples.outcome.reshape(*lead, -1),
     )
     if num_samples:
-        drawn_poses = poses[:drawn].reshape(drawn, *lead, 7)
-        samples = result._replace(visual=images["visual"], tactile=images["tactile"], pose=drawn_poses)
-        result = result._replace(samples=samples)
+        images = {name: x.reshape(drawn, *lead, *x.shape[2:]) for name, x in samples.images.items()}
+        of_samples = poses[:drawn].reshape(drawn, *lead, 7)
+        drawn_samples = result._replace(visual=images["visual"], tactile=images["tactile"], pose=of_samples)
+        result = result._replace(samples=drawn_samples)
     return result
 
 
@@ -222,14 +214,12 @@ def flagged(prediction: Prediction, valid: Bool[Array, "*n"], *, leading: int = 
     def flag(leaf: Array, axes: int) -> Array:
         return jnp.where(valid.reshape(*valid.shape, *(1,) * axes), leaf, jnp.nan)
 
-    images, numbers = functools.partial(flag, axes=3), functools.partial(flag, axes=1)
+    values: dict[str, Any] = prediction._asdict()
+    samples, measurements = values.pop("samples"), values.pop("measurements")
+    for name, leaf in values.items():
+        values[name] = None if leaf is None else flag(leaf, 3 if name in statespace.IMAGES else 1)
     return Prediction(
-        visual=jax.tree.map(images, prediction.visual),  # None stays None
-        tactile=jax.tree.map(images, prediction.tactile),
-        pose=jax.tree.map(numbers, prediction.pose),
-        mean=numbers(prediction.mean),
-        log_var=numbers(prediction.log_var),
-        samples=None if prediction.samples is None else flagged(prediction.samples, valid, leading=1),
-        outcome_probability=jax.tree.map(numbers, prediction.outcome_probability),
-        measurements=jax.tree.map(lambda leaf: flag(leaf, leaf.ndim - valid.ndim - leading), prediction.measurements),
+        **values,
+        samples=None if samples is None else flagged(samples, valid, leading=1),
+        measurements=jax.tree.map(lambda leaf: flag(leaf, leaf.ndim - valid.ndim - leading), measurements),
     )

@@ -5,9 +5,10 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import nnx
 
 import sts_jax as sts
-from sts_jax import objects, statespace, training
+from sts_jax import mvae, objects, statespace, training
 
 TINY = statespace.Config(
     input_size=16,
@@ -45,15 +46,18 @@ def random_states(rng, number):
     return statespace.encode(random_codes(rng, number), *(jnp.asarray(x, jnp.float32) for x in solid))
 
 
-def state_model(**changes):
-    """A predictor with an untrained state-space model."""
-    size = STATE.input_size
-    view = {"resolution": (size, size), "condition_scale": (10.0, 10.0, 0.1)} | changes
-    graphdef, params, _ = statespace.init(jax.random.key(0), STATE)
-    settings = {"kind": "statespace", "model": STATE.to_json()}
-    model = training.Model(STATE, graphdef, params, 0, settings)
-    grey = np.full((size, size, 3), 178, np.uint8)
-    return sts.Predictor(model, training.Preprocessing(**view), (grey, grey), "new")
+def untrained(config, **view):
+    """A predictor with an untrained model for images of 32x32 pixels."""
+    kind = {statespace.Config: statespace, mvae.Config: mvae}[type(config)]
+    graphdef, params, stats = kind.init(jax.random.key(0), config)
+    settings = {"kind": kind.__name__.removeprefix("sts_jax."), "model": dataclasses.asdict(config)}
+    model = training.Model(config, graphdef, nnx.merge_state(params, stats), 0, settings)
+    grey = np.full((32, 32, 3), 178, np.uint8)
+    return sts.Predictor(model, training.Preprocessing(**{"resolution": (32, 32)} | view), (grey, grey), "new")
+
+
+def state_model(**view):
+    return untrained(STATE, **{"condition_scale": (10.0, 10.0, 0.1)} | view)
 
 
 class Killed(BaseException):

@@ -80,7 +80,7 @@ def test_the_view_of_a_twin_is_the_rendering_of_the_pose_and_gives_the_same_pred
         pose, found = view()
     background = hardware.SensorView(*(np.mean(images, axis=0) for images in zip(*empties, strict=True)))
     wrench = jnp.asarray(scene._motion(0).wrench[0])
-    predict = sts.Predictor.load("freefall", resolution=(128, 128))
+    predict = sts.Predictor.load("freefall")
     frame = sts.sense(sensor, body, jnp.asarray(pose), wrench, resolution=(128, 128))
     lit = hardware.relit(found, background, hardware.SensorView(**predict.empty))
     for stream in ("visual", "tactile"):

@@ -91,7 +91,7 @@ def test_the_loss_equals_a_loop_over_subsets_and_samples(asked):
                 precision, weighted = np.ones(4), np.zeros(4)
                 for i in left:
                     name = VECTORS.names[i]
-                    q = model.encode(name, inputs[name][b : b + 1], None)
+                    q = model.encoders[name](inputs[name][b : b + 1], None)
                     precision = precision + np.exp(-np.asarray(q.log_var[0]))
                     weighted = weighted + np.exp(-np.asarray(q.log_var[0])) * np.asarray(q.mean[0])
                 mean, var = weighted / precision, 1 / precision
@@ -102,7 +102,7 @@ def test_the_loss_equals_a_loop_over_subsets_and_samples(asked):
                 total += 0.3 * divergence / BATCH
                 for i, m in enumerate(VECTORS.modalities):
                     if (asked == "all" or i in subset) and known[m.name][b]:
-                        error = np.mean((model.decode(m.name, z, None)[0] - targets[m.name][b]) ** 2)
+                        error = np.mean((model.decoders[m.name](z, None)[0] - targets[m.name][b]) ** 2)
                         total += m.weight * error / BATCH
     np.testing.assert_allclose(value, total, rtol=1e-4)
     np.testing.assert_allclose(terms.kl, kl / counted, rtol=1e-4)

@@ -11,7 +11,7 @@ from flax import nnx
 from scipy import special, stats
 from statespace_config import STATE, finite, random_codes, random_states, same, unit
 
-from sts_jax import optics, statespace
+from sts_jax import optics, statespace, storage
 from sts_jax.evaluation import metrics
 from sts_jax.mvae import Gaussian
 from sts_jax.statespace import config, harmonics, networks, objective, poses, state
@@ -391,4 +391,4 @@ def test_beliefs_of_falls_are_exact_or_have_noise_of_their_variance():
 )
 def test_config_rejects_values_out_of_range(change, message):
     with pytest.raises(ValueError, match=message):
-        statespace.Config.from_json(CONFIG.to_json() | change)
+        storage.decode(statespace.Config, dataclasses.asdict(CONFIG) | change, "model")

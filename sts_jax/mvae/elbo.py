@@ -124,7 +124,7 @@ def loss(
         target = targets[modality.name]
         known = (target_present or {}).get(modality.name, jnp.ones(batch, bool))
         weights = (times[:, None] * counts[jnp.array(rows)] * known[None]).reshape(-1)
-        output = model.decode(modality.name, z[jnp.array(rows)].reshape(-1, z.shape[-1]), weights)
+        output = model.decoders[modality.name](z[jnp.array(rows)].reshape(-1, z.shape[-1]), weights)
         target = jnp.where(_over(known, target), target, 0)
         error = _error(modality, output.reshape(len(rows), *target.shape), target[None])
         summed = jnp.sum(weights * error.reshape(-1)) / batch
@@ -178,7 +178,9 @@ def decode(
     model = nnx.merge(graphdef, state)
     z = _with_condition(model.config, z, condition)
     flat = z.reshape(-1, z.shape[-1])
-    return {m.name: model.decode(m.name, flat, None).reshape(*z.shape[:-1], *m.shape) for m in model.config.modalities}
+    return {
+        m.name: model.decoders[m.name](flat, None).reshape(*z.shape[:-1], *m.shape) for m in model.config.modalities
+    }
 
 
 def predict(
@@ -232,7 +234,7 @@ def _experts(
             continue
         mask = present.get(name, jnp.ones(batch, bool)).astype(bool)
         x = jnp.where(_over(mask, inputs[name]), inputs[name], 0)
-        experts.append(model.encode(name, x, mask.astype(jnp.float32) if training else None))
+        experts.append(model.encoders[name](x, mask.astype(jnp.float32) if training else None))
         masks.append(mask)
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *experts), jnp.stack(masks)
 

@@ -8,8 +8,8 @@ Source: the paper's supplement, "Network Architecture". The hidden widths are th
 
 import itertools
 import math
-from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,6 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sts_jax import storage
 from sts_jax.mvae.convolutions import conv, conv_transpose
 from sts_jax.mvae.gaussian import Gaussian
 
@@ -79,15 +78,6 @@ class Config:
     def names(self) -> tuple[str, ...]:
         """The names of the modalities."""
         return tuple(m.name for m in self.modalities)
-
-    def to_json(self) -> dict[str, Any]:
-        """The fields by name, in values that `json.dumps` accepts."""
-        return asdict(self)
-
-    @classmethod
-    def from_json(cls, values: dict[str, Any]) -> "Config":
-        """Make a configuration from the result of `to_json`, or from the same values of a JSON file."""
-        return storage.decode(cls, values, "model")
 
 
 class _Linear(nnx.Module):
@@ -229,7 +219,12 @@ class _VectorDecoder(nnx.Module):
 
 
 class MVAE(nnx.Module):
-    """A multimodal variational autoencoder with one encoder and one decoder for each modality."""
+    """A multimodal variational autoencoder with one encoder and one decoder for each modality.
+
+    An encoder maps images in [0, 1] or vectors, `(batch, *shape)`, to the expert, `(batch, latent)`. A decoder maps
+    latents with the condition, `(batch, latent + condition)`, to predictions, `(batch, *shape)`, logits for images.
+    Their second argument has the weights of the samples in batch normalisation. None uses the running statistics.
+    """
 
     def __init__(self, config: Config) -> None:
         self.config = config
@@ -237,30 +232,6 @@ class MVAE(nnx.Module):
         decoders = {"image": _ImageDecoder, "vector": _VectorDecoder}
         self.encoders = nnx.Dict({m.name: encoders[m.kind](m, config) for m in config.modalities})
         self.decoders = nnx.Dict({m.name: decoders[m.kind](m, config) for m in config.modalities})
-
-    def encode(self, name: str, x: Array, weights: Array | None) -> Gaussian:
-        """The expert of one modality.
-
-        Args:
-            x: Images in [0, 1] or vectors, `(batch, *shape)`.
-            weights: Weight of each sample in batch normalisation. None uses the running statistics.
-
-        Returns:
-            Mean and log variance of the latent, `(batch, latent)`.
-        """
-        return self.encoders[name](x, weights)
-
-    def decode(self, name: str, z: Array, weights: Array | None) -> Array:
-        """Predict one modality from latents, to which the condition is appended.
-
-        Args:
-            z: Latents, `(batch, latent + condition)`.
-            weights: Weight of each sample in batch normalisation. None uses the running statistics.
-
-        Returns:
-            The predictions, `(batch, *shape)`. Images are logits.
-        """
-        return self.decoders[name](z, weights)
 
 
 def init(key: PRNGKeyArray, config: Config) -> tuple[nnx.GraphDef[MVAE], nnx.State, nnx.State]:

@@ -15,7 +15,6 @@ import functools
 import itertools
 import math
 from collections.abc import Iterable, Iterator
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -37,13 +36,8 @@ _BOUNDS = ((-math.log(4), math.log(4)), (-math.log(4), 0), (0, math.log(4)))
 _PRIOR = 0.5  # standard deviation of the logarithms in the prior, which is a normal distribution about 0
 
 
-class _Chunk(NamedTuple):
-    """Items of one compiled call: the arguments of `predict` between the model and the calibration."""
-
-    inputs: dict[str, np.ndarray]
-    present: dict[str, np.ndarray]
-    empty: dict[str, np.ndarray]
-    condition: np.ndarray | None
+# Items of one compiled call: the arguments of `predict` between the model and the calibration
+_Chunk = tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, np.ndarray], np.ndarray | None]
 
 
 def fit(
@@ -157,7 +151,7 @@ def _chunks(
     for start in range(0, len(rows), _CHUNK):
         some = rows[np.arange(start, start + _CHUNK) % len(rows)]
         given = {name: _unit(values[some]) for name, values in inputs.items()}
-        yield _Chunk(given, present, shown, None if condition is None else condition[some])
+        yield given, present, shown, None if condition is None else condition[some]
 
 
 @functools.partial(jax.jit, static_argnames="graphdef")

@@ -1,9 +1,7 @@
 """The configuration of a state-space model."""
 
 import dataclasses
-from typing import Any
 
-from sts_jax import storage
 from sts_jax.statespace import harmonics
 
 IMAGES = ("visual", "tactile")  # names of the images
@@ -85,12 +83,3 @@ class Config:
     def look(self) -> int:
         """Number of values in the appearance code."""
         return self.traits + (self.own + self.shown) * harmonics.number(self.degree)
-
-    def to_json(self) -> dict[str, Any]:
-        """The fields by name, in values that `json.dumps` accepts."""
-        return dataclasses.asdict(self)
-
-    @classmethod
-    def from_json(cls, values: dict[str, Any]) -> "Config":
-        """Make a configuration from the result of `to_json`, or from the same values of a JSON file."""
-        return storage.decode(cls, values, "model")

@@ -31,7 +31,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from sts_jax.mvae import Gaussian, kl_standard_normal
 from sts_jax.statespace import poses, state, window
-from sts_jax.statespace.config import IMAGES, TINT, LossWeights
+from sts_jax.statespace.config import IMAGES, TINT
 from sts_jax.statespace.networks import (
     EXACT_LOG_VAR,
     FinalPose,
@@ -194,14 +194,8 @@ def loss(
         of_views = fuse(jax.tree.map(lambda x: x[:first], seen), known)
         before = _present_pictures(views["state"][:first], of_views, {"visual": views["visual"][:first]}, known)
     terms |= _picture_terms(model, (noise, other), after, before, empty)
-    return _weighted(config.weights, terms, beta), terms
-
-
-def _weighted(
-    weights: LossWeights, terms: dict[str, Float[Array, ""]], beta: float | Float[Array, ""]
-) -> Float[Array, ""]:
-    """The weighted sum of the terms."""
-    return (
+    weights = config.weights
+    total = (
         terms["visual"]
         + weights.tactile * terms["tactile"]
         + weights.covered * terms["covered"]
@@ -211,6 +205,7 @@ def _weighted(
         + weights.outcome * terms["outcome"]
         + beta * weights.look * terms["look"]
     )
+    return total, terms
 
 
 def rotation_between(code: Float[Array, "n code"], pose: Float[Array, "n 12"]) -> Float[Array, "n 3 3"]:

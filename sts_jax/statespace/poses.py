@@ -27,7 +27,7 @@ def heading(code: Float[Array, "*n 12"]) -> Float[Array, "*n 2"]:
     rotation. If the projection of the chosen axis is almost 0, the heading is the x axis of the sensor frame. No
     gradient flows through the heading. The matrix of `code` may be a mean of several rotation matrices.
     """
-    columns = jax.lax.stop_gradient(code[..., 3:].reshape(*code.shape[:-1], 3, 3)[..., :2, :])
+    columns = jax.lax.stop_gradient(matrix(code)[..., :2, :])
     lengths = jnp.linalg.norm(columns, axis=-2)
     least_steep = jnp.argmax(lengths, axis=-1)
     axis = jnp.where(lengths[..., 0] > LEVEL, 0, jnp.where(lengths[..., 2] > LEVEL, 2, least_steep))
@@ -65,8 +65,7 @@ def nearest(turn: Float[Array, "*n 9"]) -> Float[Array, "*n 3 3"]:
 
 def rigid(code: Float[Array, "*n 12"]) -> Float[Array, "*n 12"]:
     """Replace the matrix in each pose code by the nearest rotation matrix."""
-    quat = geometry.quat_from_matrix(code[..., 3:].reshape(*code.shape[:-1], 3, 3))
-    return jnp.concatenate([code[..., :3], geometry.quat_to_matrix(quat).reshape(*code.shape[:-1], 9)], axis=-1)
+    return jnp.concatenate([code[..., :3], nearest(code[..., 3:]).reshape(*code.shape[:-1], 9)], axis=-1)
 
 
 def turn(angle: Float[Array, "*#n 2"], vector: Float[Array, "*#n 2"]) -> Float[Array, "*#n 2"]:
@@ -83,7 +82,7 @@ def turn_back(angle: Float[Array, "*#n 2"], vector: Float[Array, "*#n 2"]) -> Fl
 def turn_code(angle: Float[Array, "*#n 2"], code: Float[Array, "*#n 12"]) -> Float[Array, "*#n 12"]:
     """Pose codes after a rotation of the whole scene about the z axis of the sensor frame."""
     position = jnp.concatenate([turn(angle, code[..., :2]), code[..., 2:3]], axis=-1)
-    rows = code[..., 3:].reshape(*code.shape[:-1], 3, 3)
+    rows = matrix(code)
     level = turn(angle[..., None, :], jnp.swapaxes(rows[..., :2, :], -1, -2))
     rows = jnp.concatenate([jnp.swapaxes(level, -1, -2), rows[..., 2:, :]], axis=-2)
     return jnp.concatenate([position, rows.reshape(*code.shape[:-1], 9)], axis=-1)

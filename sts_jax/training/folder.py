@@ -282,7 +282,7 @@ def _load(workdir: Path, calibrated: bool) -> Model:
     settings = storage.read_json(path, f"delete {workdir} and train again")
     try:
         kind = KINDS[settings["kind"]]
-        config = kind.Config.from_json(settings["model"])
+        config = storage.decode(kind.Config, settings["model"], "model")
         graphdef, params, stats = jax.eval_shape(lambda: kind.init(jax.random.key(0), config))
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(

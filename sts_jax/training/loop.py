@@ -233,7 +233,7 @@ def train(
         task = task._replace(loss=loss)
     settings = {
         "kind": next(name for name, kind in KINDS.items() if isinstance(model, kind.Config)),
-        "model": model.to_json(),
+        "model": asdict(model),
         "training": asdict(config),
         "targets": targets,
         "absent": list(absent),
