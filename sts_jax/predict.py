@@ -191,7 +191,7 @@ class Predictor:
                 valid.append(fine | ignored)
             elif not np.all(fine | ignored):
                 raise ValueError(_reason(name, self._kinds[name], np.asarray(array)[~(fine | ignored)]))
-        return self._predicted(inputs, masks, lead, condition, valid, key if num_samples else None, num_samples)
+        return self._predicted(inputs, masks, lead, condition, valid, key, num_samples)
 
     @checked
     def prior(self, shape: tuple[int, ...] = (), *, condition: Numbers | None = None) -> Prediction:
@@ -211,13 +211,14 @@ class Predictor:
         model, view = self.model, self.preprocessing
         condition, fine = self._condition(condition, lead)
         graphdef, state = model.graphdef, model.state
+        shared = condition, key if num_samples else None, num_samples, lead
         if isinstance(model.config, mvae.Config):
-            more = condition, key, num_samples, lead
-            result = predict(graphdef, state, view, self._empty["tactile"], inputs, present, *more)
+            result = predict(graphdef, state, view, self._empty["tactile"], inputs, present, *shared)
         else:
             inputs, present = completed(self._inputs, view.resolution, inputs, present, lead)
-            more = condition, key, num_samples, lead, model.calibration
-            result = predict_samples(graphdef, state, view, self._empty, inputs, present, *more)
+            result = predict_samples(
+                graphdef, state, view, self._empty, inputs, present, *shared, calibration=model.calibration
+            )
         valid = valid if fine is None else [*valid, fine]
         return flagged(result, jnp.all(jnp.stack(valid), axis=0)) if valid else result
 

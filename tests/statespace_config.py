@@ -6,9 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
+from scipy import special
 
 import sts_jax as sts
 from sts_jax import mvae, objects, statespace, training
+from sts_jax.statespace import networks, poses
 
 TINY = statespace.Config(
     input_size=16,
@@ -44,6 +46,40 @@ def random_states(rng, number):
     support = np.max(points @ objects.DIRECTIONS.T.astype(np.float64), axis=1)
     solid = support, rng.uniform(0.02, 0.2, number), 0.005 * rng.normal(size=(number, 3))
     return statespace.encode(random_codes(rng, number), *(jnp.asarray(x, jnp.float32) for x in solid))
+
+
+def trajectories(number):
+    """Random inputs, targets and conditions of trajectories, and images of the empty sensor.
+
+    A rectangle in each image is the object. The last images are the reduced first images of other trajectories.
+    """
+    rng = np.random.default_rng(0)
+    empty = {name: rng.uniform(0.3, 0.6, (32, 32, 3)).astype(np.float32) for name in statespace.IMAGES}
+    images = {name: np.tile(image, (number, 1, 1, 1)) for name, image in empty.items()}
+    for image in images.values():
+        for i in range(number):
+            image[i, 5 + 2 * (i % 4) : 20, 8 : 16 + 3 * (i % 4)] = rng.uniform(0.1, 0.9, 3)
+    small = {name: x.reshape(number, 16, 2, 16, 2, 3).mean((2, 4))[::-1] for name, x in images.items()}
+    code, final = np.asarray(random_states(rng, number)), np.asarray(random_codes(rng, number))
+    return {
+        "inputs": images | {"pose": code[:, : poses.CODE]},
+        "targets": small | {"state": code, "pose": final, "outcome": np.arange(number) % STATE.outcomes},
+        "condition": rng.normal(size=(number, STATE.condition)).astype(np.float32),
+        "empty": empty,
+    }
+
+
+def random_densities(rng, number, components=1, angle=0.0):
+    """Random densities of the final pose, with the heading at an angle."""
+    shape = (number, STATE.outcomes, components)
+    numbers = {
+        "outcome": special.log_softmax(rng.normal(size=shape[:2]), axis=1),
+        "weight": special.log_softmax(rng.normal(size=shape), axis=2),
+        "mean": rng.normal(size=(*shape, poses.MOVE)),
+        "log_var": rng.uniform(-3, 0, (*shape, poses.MOVE)),
+        "heading": np.broadcast_to(unit(angle), (number, 2)),
+    }
+    return networks.FinalPose(**{name: jnp.asarray(x, jnp.float32) for name, x in numbers.items()})
 
 
 def untrained(config, **view):

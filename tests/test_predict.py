@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
 from scipy import optimize
-from statespace_config import STATE, finite, state_model, untrained
+from statespace_config import STATE, finite, same, state_model, untrained
 
 import sts_jax as sts
 from sts_jax import mvae, statespace, training
@@ -163,6 +163,7 @@ def test_a_saved_predictor_predicts_the_same(kind, compact, request, tmp_path):
     again = sts.Predictor.load(copy)
     assert repr(again) == repr(original).replace(original.name, str(copy))
     assert (again.preprocessing, again.model.config) == (original.preprocessing, original.model.config)
+    same(again.model.calibration, original.model.calibration)
     more = {"condition": CONDITION} if original.model.config.condition else {}
     close(again(**GIVEN, **more)._replace(pose=None), original(**GIVEN, **more)._replace(pose=None), 5e-3 * compact)
     again.save(tmp_path / "second", compact=compact)
@@ -226,6 +227,8 @@ def test_only_an_invalid_traced_item_gives_nan(predictor, name, change):
 def state_predictor(tmp_path_factory):
     folder = tmp_path_factory.mktemp("statespace") / "saved"
     state_model().save(folder)
+    numbers = statespace.Calibration(*(jnp.full(8, x) for x in (0.8, 0.9, 1.5, 30.0)))
+    training.save_calibration(folder, numbers, STATE.inputs)
     return sts.Predictor.load(folder)
 
 

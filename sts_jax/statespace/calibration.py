@@ -15,12 +15,13 @@ import functools
 import itertools
 import math
 from collections.abc import Iterable, Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 from scipy import optimize
 
 from sts_jax.statespace.networks import CONTRAST, FinalPose, Model, compose
@@ -34,10 +35,8 @@ _MOST = 128  # largest number of items for the choice of the contrast
 # Bounds of the logarithms of the three numbers. The last two allow a wider density of the pose, and no narrower one.
 _BOUNDS = ((-math.log(4), math.log(4)), (-math.log(4), 0), (0, math.log(4)))
 _PRIOR = 0.5  # standard deviation of the logarithms in the prior, which is a normal distribution about 0
-
-
 # Items of one compiled call: the arguments of `predict` between the model and the calibration
-_Chunk = tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, np.ndarray], np.ndarray | None]
+_Chunk = tuple[dict[str, Any], dict[str, Any], dict[str, Any], Any]
 
 
 def fit(
@@ -99,7 +98,7 @@ def _contrast(
     true = np.array(gradient_energy(jnp.asarray(_unit(target))))
     subsets = 2 ** len(nnx.merge(graphdef, params).config.inputs)
     correction = Calibration(*(jnp.full(subsets, x, jnp.float32) for x in (*numbers, CONTRAST)))
-    parts = [_energies(graphdef, params, *chunk, correction) for chunk in chunks]
+    parts = [_energies(graphdef, params, chunk, correction) for chunk in chunks]
     energies = np.concatenate(parts, axis=1)[:, : len(target)].mean(1)
     if true.sum() == 0 or not (energies > 0).all():
         return CONTRAST
@@ -114,17 +113,11 @@ def gradient_energy(images: Float[Array, "*n h w 3"]) -> Float[Array, "*n"]:
 
 @functools.partial(jax.jit, static_argnames="graphdef")
 def _energies(
-    graphdef: nnx.GraphDef[Model],
-    params: nnx.State,
-    inputs: dict[str, Array],
-    present: dict[str, Bool[Array, "n"]],
-    empty: dict[str, Float[Array, "size size 3"]],
-    condition: Float[Array, "n c"] | None,
-    correction: Calibration,
+    graphdef: nnx.GraphDef[Model], params: nnx.State, chunk: _Chunk, correction: Calibration
 ) -> Float[Array, "contrasts n"]:
     """Mean gradient energy of the samples of each item, for each of the contrasts."""
     model, key = nnx.merge(graphdef, params), jax.random.key(0)
-    samples = draw(model, key, inputs, present, empty, condition, correction, num=_SAMPLES, drawn=_SAMPLES)
+    samples = draw(model, key, *chunk, correction, num=_SAMPLES, drawn=_SAMPLES)
     energies = [
         gradient_energy(compose(samples.layers, samples.empty, samples.level, contrast)["visual"])
         for contrast in CONTRASTS
@@ -134,7 +127,7 @@ def _energies(
 
 def _densities(graphdef: nnx.GraphDef[Model], params: nnx.State, chunks: Iterable[_Chunk], number: int) -> FinalPose:
     """Predict the densities of the first `number` items of the chunks."""
-    parts = [_density(graphdef, params, *chunk) for chunk in chunks]
+    parts = [_density(graphdef, params, chunk) for chunk in chunks]
     return jax.tree.map(lambda *x: jnp.concatenate(x)[:number], *parts)
 
 
@@ -155,15 +148,8 @@ def _chunks(
 
 
 @functools.partial(jax.jit, static_argnames="graphdef")
-def _density(
-    graphdef: nnx.GraphDef[Model],
-    params: nnx.State,
-    inputs: dict[str, Array],
-    present: dict[str, Bool[Array, "n"]],
-    empty: dict[str, Float[Array, "size size 3"]],
-    condition: Float[Array, "n c"] | None,
-) -> FinalPose:
-    return predict(nnx.merge(graphdef, params), inputs, present, empty, condition)[1]
+def _density(graphdef: nnx.GraphDef[Model], params: nnx.State, chunk: _Chunk) -> FinalPose:
+    return predict(nnx.merge(graphdef, params), *chunk)[1]
 
 
 def _unit(values: np.ndarray) -> np.ndarray:

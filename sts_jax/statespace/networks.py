@@ -140,15 +140,6 @@ def _shape(
     ]
 
 
-def _appearance(
-    config: Config, look: Array, own_turn: Float[Array, "n 3 3"], shown_turn: Float[Array, "n 3 3"]
-) -> list[Array]:
-    """Traits of appearance codes, and values of their functions at fixed directions, after one rotation each."""
-    traits, own, shown = parts(config, look)
-    directions = objects.lattice(config.directions)
-    return [traits, harmonics.values(own, own_turn, directions), harmonics.values(shown, shown_turn, directions)]
-
-
 def _joined(*features: Float[Array, "n ..."]) -> Float[Array, "n k"]:
     """Flatten and concatenate the features of each item."""
     return jnp.concatenate([x.reshape(len(x), -1) for x in features], axis=-1)
@@ -335,8 +326,10 @@ class Decoder(nnx.Module):
         level = jnp.swapaxes(poses.about_vertical(heading), -1, -2)
         shape = state.split(known)
         turns = (poses.matrix(here), level @ turn)
-        drawn = (*_appearance(config, look, *turns), *_shape(config, shape, *turns))
-        x = _joined(here, heading, pose[:, :2], *drawn)
+        traits, own, shown = parts(config, look)
+        directions = objects.lattice(config.directions)
+        seen = harmonics.values(own, turns[0], directions), harmonics.values(shown, turns[1], directions)
+        x = _joined(here, heading, pose[:, :2], traits, *seen, *_shape(config, shape, *turns))
         x = self.core(jax.nn.swish(self.residual(self.first(x))))
         x = self.widen(x.reshape(len(x), config.canvas // 8, config.canvas // 8, -1))
         for layer, enlarge in zip(self.layers, self.enlarge, strict=False):

@@ -37,15 +37,6 @@ def heading(code: Float[Array, "*n 12"]) -> Float[Array, "*n 2"]:
     return jnp.where(length > 1e-3, chosen / jnp.maximum(length, 1e-3), jnp.array([1.0, 0.0]))
 
 
-def certainty(code: Float[Array, "*n 12"]) -> Float[Array, "*n"]:
-    """The certainty of each object's rotation: 0 for an unknown rotation, and at least 0.8 for a known one.
-
-    It is the length of the longest projection of a mesh axis onto the plane of the pad. If the rotation is uncertain,
-    the mean of its possible matrices has shorter columns.
-    """
-    return jnp.max(jnp.linalg.norm(matrix(code)[..., :2, :], axis=-2), axis=-1)
-
-
 def matrix(code: Float[Array, "*n 12"]) -> Float[Array, "*n 3 3"]:
     """The 3x3 matrix in each pose code. For a mean of several codes, it is in general not a rotation matrix."""
     return code[..., 3:].reshape(*code.shape[:-1], 3, 3)

@@ -108,11 +108,14 @@ def reach(state: State, rotation: Float[Array, "n 3 3"]) -> Float[Array, "n"]:
 def heading(state: State) -> Float[Array, "n 2"]:
     """The heading of each object, from mean state codes.
 
-    If the rotation is known well enough (`poses.certainty` above 0.5), it is `poses.heading`. Otherwise, it is the long
-    axis of the object's shape in the plane of the pad, with an arbitrary sign. No gradient flows through the heading.
+    If the rotation is known, it is `poses.heading`. Otherwise, it is the long axis of the object's shape in the plane
+    of the pad, with an arbitrary sign. No gradient flows through the heading.
     """
     state = jax.lax.stop_gradient(state)
-    certain = poses.certainty(state.pose)[:, None] > 0.5  # 0 for an unknown rotation, at least 0.8 for a known one
+    # The longest projection of a mesh axis onto the pad is at least 0.8 for a known rotation. An uncertain rotation is
+    # a mean of several matrices, whose columns are shorter.
+    projections = jnp.linalg.norm(poses.matrix(state.pose)[..., :2, :], axis=-2)
+    certain = jnp.max(projections, axis=-1)[:, None] > 0.5
     # The harmonics of degree 2 and orders 2 and -2 give twice the angle of the long axis.
     twice = jnp.arctan2(state.support_in_sensor[:, 8], state.support_in_sensor[:, 7])
     long = jnp.stack([jnp.cos(twice / 2), jnp.sin(twice / 2)], axis=-1)
