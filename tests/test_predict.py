@@ -55,8 +55,8 @@ def measurement(*lead, seed=0):
 @pytest.mark.parametrize(
     "names", [s for n in (1, 2, 3) for s in itertools.combinations(("visual", "tactile", "pose"), n)]
 )
-@pytest.mark.parametrize("lead", [(), (2,), (2, 3)])
-def test_any_subset_and_any_leading_axes(predictor, names, lead):
+def test_any_subset_and_any_leading_axes(predictor, names):
+    lead = ((2, 3), (2,), ())[len(names) - 1]
     given = {name: value for name, value in measurement(*lead).items() if name in names}
     out = predictor(**given)
     assert out.visual.shape == out.tactile.shape == (*lead, SIDE, SIDE, 3)

@@ -52,11 +52,8 @@ def fit(
     """Fit the calibration of a model, by maximum likelihood with a prior that favours values near 1.
 
     Args:
-        inputs: All inputs of the model by name: images `visual` and `tactile` `(n, size, size, 3)`, uint8 or in [0, 1],
-            and pose codes `pose` `(n, 12)`.
-        targets: `state` has the state codes of the first frames, `pose` the pose codes of the last frames, `outcome`
-            indices into the outcomes of the scenario, `(n,)`, and `visual` the visual images of the last frames,
-            `(n, image_size, image_size, 3)`, uint8 or in [0, 1].
+        inputs: As in `loss`. Images may be uint8.
+        targets: `state`, `pose`, `outcome` and `visual` as in `loss`. Images may be uint8.
         empty: `visual` and `tactile` image of the empty sensor, uint8 or in [0, 1].
         present: Masks `(n,)` of the inputs. An input without a mask is present in all items.
         condition: From `training.Preprocessing.encode_condition`, or None.

@@ -164,7 +164,9 @@ def loss(
     subsets = [s for size in range(1, len(config.inputs) + 1) for s in itertools.combinations(config.inputs, size)]
     members = [{name: counts[name] & (name in subset) for name in config.inputs} for subset in subsets]
     beliefs = [fuse(estimates, masks) for masks in members]
-    ends = [_ends(belief, masks, targets, condition) for belief, masks in zip(beliefs, members, strict=True)]
+    truth = targets["state"], targets["pose"], targets["outcome"], condition
+    usable = [jnp.any(jnp.stack(list(masks.values())), axis=0) for masks in members]
+    ends = [_Ends(of_state(belief), *truth, masks) for belief, masks in zip(beliefs, usable, strict=True)]
     if falls is not None:
         ends.append(_known_ends(blur, falls))
     terms |= _end_terms(model, jax.tree.map(lambda *x: jnp.concatenate(x), *ends))
@@ -247,17 +249,6 @@ def _state_error(expert: Gaussian, code: Float[Array, "n code"], counts: Bool[Ar
     nats = 0.5 * jnp.sum(scatter + log_var + math.log(2 * math.pi), axis=-1)
     number = jnp.maximum(jnp.sum(counts), 1)
     return jnp.sum(counts * error) / number, jnp.sum(counts * nats) / number
-
-
-def _ends(
-    belief: Gaussian,
-    counts: dict[str, Bool[Array, "n"]],
-    targets: dict[str, Array],
-    condition: Float[Array, "n c"] | None,
-) -> _Ends:
-    """The trajectories of a batch with their belief from some of the inputs. `counts` has the masks of these inputs."""
-    counted = jnp.any(jnp.stack(list(counts.values())), axis=0)
-    return _Ends(of_state(belief), targets["state"], targets["pose"], targets["outcome"], condition, counted)
 
 
 def _drawn_belief(
