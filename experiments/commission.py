@@ -11,8 +11,6 @@ which `Sensor.load` and `hardware.STS.from_file` read. Pictures of the board are
 continues after an interruption.
 """
 
-import shlex
-
 import tyro
 
 from experiments.shared.commissioning import Config, commission
@@ -20,27 +18,15 @@ from experiments.shared.terminal import on_one_line
 from sts_jax import hardware
 
 
-def find(config: Config) -> str:
-    """List the cameras and USB serial ports among which the user must choose, and the command to run next."""
-    lines, words = [], ["python", "-m", "experiments.commission"]
+def find() -> None:
+    """List the cameras and the USB serial ports among which the user must choose."""
     ports = [port for port in hardware.find_controllers() if port.vid is not None]
-    cameras = {camera.source: str(camera) for camera in hardware.find_cameras()}
-    controllers = {p.device: f"{p.device} ({p.description}, serial number {p.serial_number})" for p in ports}
-    for option, given, kind, there, remedy in (
-        ("--camera", config.camera, "camera", cameras, "connect one, or give the URL of one"),
-        (
-            *("--leds", config.leds, "USB serial port", controllers),
-            "connect the controller by USB, or give the name of another port",
-        ),
+    controllers = [f"{port.device} ({port.description}, serial number {port.serial_number})" for port in ports]
+    for option, kind, devices in (
+        ("--camera", "cameras", [str(camera) for camera in hardware.find_cameras()]),
+        ("--leds", "USB serial ports", controllers),
     ):
-        if given is not None:
-            words += [option, given]
-            continue
-        if not there:
-            raise ValueError(f"no {kind} was found: {remedy} with {option}")
-        lines += [f"{kind}s:", *(f"  {line}" for line in there.values())]
-        words += [option, next(iter(there)) if len(there) == 1 else option[2:].upper()]
-    return "\n".join([*lines, f"next: {shlex.join([*words, '--out', str(config.out)])}"])
+        print(f"{kind}, give one as {option}:", *(devices or ["none was found: connect one"]), sep="\n  ")
 
 
 def main(config: Config) -> None:
@@ -49,7 +35,7 @@ def main(config: Config) -> None:
         hardware.save_board(config.print_board)
         print(f"{config.print_board}: print it at 100 % on A4. The ruler on the page must measure 100 mm")
     elif config.camera is None or config.leds is None:
-        print(find(config))
+        find()
     else:
         commission(config)
 
@@ -60,7 +46,4 @@ if __name__ == "__main__":
         with on_one_line():
             main(arguments)
     except KeyboardInterrupt:
-        number = len(list((arguments.out / "board").glob("*.png")))
-        raise SystemExit(
-            f"interrupted. Number of kept pictures of the board: {number}. Run the command again to continue"
-        ) from None
+        raise SystemExit("interrupted. The pictures of the board are kept: run the command again to continue") from None

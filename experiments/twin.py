@@ -7,39 +7,34 @@ The command prints the addresses of the twin and runs until Ctrl-C. The first st
 Later starts take about 20 s.
 """
 
-import signal
+import contextlib
 import sys
 import threading
 
 import tyro
 
 import sts_jax as sts
+from experiments.shared import terminal
 from experiments.shared.device import TwinConfig, make_twin
-from experiments.shared.terminal import on_one_line
 from sts_jax.hardware import twin
 
 
 def main(config: TwinConfig) -> None:
     """Let other programs use the twin until Ctrl-C, SIGTERM or, with `attached`, the end of the standard input."""
-    stop = threading.Event()
     print("preparing the first images ...", flush=True)
-    with make_twin(config) as device:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: stop.set())
-        with twin.Served(device, link=config.port, host=config.host, http_port=config.http_port) as served:
-            print(f"{served.description}\nCtrl-C ends it.", flush=True)
-            if config.attached:
-                threading.Thread(target=_until_end_of_input, args=(stop,), daemon=True).start()
-            stop.wait()
-
-
-def _until_end_of_input(stop: threading.Event) -> None:
-    """Wait for the end of the standard input, then stop the twin."""
-    sys.stdin.read()
-    stop.set()
+    with (
+        make_twin(config) as device,
+        twin.Served(device, link=config.port, host=config.host, http_port=config.http_port) as served,
+    ):
+        print(f"{served.description}\nCtrl-C ends it.", flush=True)
+        if config.attached:
+            sys.stdin.read()
+        else:
+            threading.Event().wait()
 
 
 if __name__ == "__main__":
     sts.enable_compilation_cache()
-    with on_one_line():
+    terminal.interrupt_on_sigterm()
+    with terminal.on_one_line(), contextlib.suppress(KeyboardInterrupt):
         main(tyro.cli(TwinConfig, description=__doc__))

@@ -17,7 +17,7 @@ from session_writer import ORIGIN, SIZE, shot
 
 import sts_jax as sts
 from experiments import live
-from experiments.shared.live import SIDE, Live, Seen, Views, panel
+from experiments.shared.live import SIDE, Live, Predicted, Seen, Views, panel
 from experiments.shared.page import LivePage
 from sts_jax import hardware
 
@@ -60,13 +60,20 @@ def pair(visual=None, tactile=None, number=0):
     return made
 
 
-def predicted(predictor, *shots, **options):
+def predicted(predictor, *shots):
     """The prediction from one pair."""
-    done = threading.Event()
-    with Live(predictor, views(), (), done.set, **options) as running:
+    with Live(predictor, views(), ()) as running:
         running.offer(*shots)
-        assert done.wait(WAIT_S)
-        return running.newest
+        return wait_for(running, 1)
+
+
+def wait_for(running, number):
+    """Wait until there are `number` predictions. The newest one."""
+    limit_s = time.monotonic() + WAIT_S
+    while running.made < number:
+        assert time.monotonic() < limit_s
+        time.sleep(0.002)
+    return running.newest
 
 
 def spotted(level):
@@ -101,39 +108,32 @@ def test_contact_and_occupation(visual, tactile, contact, occupied):
     assert found.visual.shape == (SIDE, SIDE, 3)
 
 
-def test_without_a_sensor_file_contact_is_unknown():
-    done, predictor = threading.Event(), StubPredictor(modalities=("visual",), outcomes=())
-    with Live(predictor, Views(LENS, PINHOLE, None), (), done.set) as running:
-        running.offer(*pair())
-        assert done.wait(WAIT_S)
-        found = running.newest
-    assert (found.contact, found.occupied) == (None, None)
+def test_models_without_touch_and_names():
+    predictor = StubPredictor(modalities=("visual",), outcomes=())
+    found = predicted(predictor, *pair())
     assert predictor.calls[-1][1] is None  # the model takes no touch
     assert [name for name, _ in found.outcomes] == ["outcome 0", "outcome 1"]
 
 
 def test_images_are_dropped_and_never_queued():
     """While one prediction is made, ten pairs come: only the last of them is predicted from next."""
-    started, shown = threading.Semaphore(0), threading.Semaphore(0)
-    predictor, gate = StubPredictor(), threading.Event()
-    real = predictor.__class__.__call__
+    started, gate = threading.Event(), threading.Event()
 
     class Slow(StubPredictor):
         def __call__(self, **inputs):
             if len(self.calls) == 1:  # the first one after the compilation
-                started.release()
+                started.set()
                 assert gate.wait(WAIT_S)
-            return real(self, **inputs)
+            return super().__call__(**inputs)
 
     predictor = Slow()
-    with Live(predictor, views(), (), shown.release) as running:
+    with Live(predictor, views(), ()) as running:
         running.offer(*pair(grey(100)))
-        assert started.acquire(timeout=WAIT_S)
+        assert started.wait(WAIT_S)
         for level in range(110, 120):
             running.offer(*pair(grey(level)))
         gate.set()
-        for _ in range(2):
-            assert shown.acquire(timeout=WAIT_S)
+        assert wait_for(running, 2).latency_ms > 0
         assert running.offered == 11
     levels = [float(call[0][8, 8, 0]) for call in predictor.calls[1:]]
     assert levels == pytest.approx([0.6, 0.6 * 119 / 100], abs=0.01)
@@ -146,7 +146,7 @@ def test_an_error_of_the_thread_reaches_the_caller():
                 raise RuntimeError("broken")
             return super().__call__(**inputs)
 
-    with Live(Broken(), views(), (), lambda: None) as running:
+    with Live(Broken(), views(), ()) as running:
         running.offer(*pair())
         running._thread.join(WAIT_S)
         with pytest.raises(RuntimeError, match="broken"):
@@ -155,21 +155,15 @@ def test_an_error_of_the_thread_reaches_the_caller():
 
 def test_unfit_models_are_refused():
     with pytest.raises(ValueError, match="must take visual images"):
-        Live(StubPredictor(modalities=("tactile",)), views(), (), lambda: None)
+        Live(StubPredictor(modalities=("tactile",)), views(), ())
     with pytest.raises(ValueError, match=r"--condition must have 3 values, got 2"):
-        Live(StubPredictor(condition=3), views(), (1.0, 2.0), lambda: None)
+        Live(StubPredictor(condition=3), views(), (1.0, 2.0))
 
 
-def seen(level=90, **changes):
-    found = SimpleNamespace(
-        visual=grey(level + 1, (SIDE, SIDE)),
-        tactile=grey(level + 2, (SIDE, SIDE)),
-        outcomes=[("rests", 0.9), ("fell off", 0.1)],
-        contact=True,
-        occupied=True,
-    )
-    image = grey(level, (SIDE, SIDE))
-    return Seen(image, image, time.monotonic(), 15.0, found, 12.0, 0.08, 7, "held")._replace(**changes)
+def seen(level=90):
+    visual, tactile, image = (grey(level + change, (SIDE, SIDE)) for change in (1, 2, 0))
+    found = Predicted(visual, tactile, [("rests", 0.9), ("fell off", 0.1)], True, True, 12.0, 80.0)
+    return Seen(image, image, time.monotonic(), found)
 
 
 def ask(page, path, host=None):
@@ -189,7 +183,7 @@ def test_the_page_shows_a_state_and_only_to_its_own_name():
         assert json.loads(ask(page, "/view")[1]) == {"title": "A twin", "waiting": True, "ended": False}
         page.show(seen())
         facts = json.loads(ask(page, "/view")[1])
-        expected = {"rate": 12.0, "latency_ms": 80.0, "contact": True, "occupied": True, "recorded": 7, "note": "held"}
+        expected = {"rate": 12.0, "latency_ms": 80.0, "contact": True, "occupied": True, "waiting": False}
         assert {name: facts[name] for name in expected} == expected
         assert facts["outcomes"] == [["rests", 0.9], ["fell off", 0.1]]
         assert ask(page, "/view", "evil.example")[0] == 403
@@ -207,16 +201,19 @@ def test_the_page_shows_a_state_and_only_to_its_own_name():
         page.close()
 
 
+def test_a_sensor_file_without_backgrounds_is_refused(tmp_path):
+    hardware.Device("a", 30.0, "LEDS", LENS, 0.1, 0.1, (255,) * 4, "2026-05-31").save(tmp_path, sts.Sensor())
+    with pytest.raises(ValueError, match="no images of the empty pad"):
+        Views.load(tmp_path, divided=True)
+
+
 @pytest.mark.parametrize(
     ("options", "match"),
     [
-        ({"twin": True, "replay": "a"}, "--twin and --replay exclude each other"),
-        ({"twin": True, "sensor": "a"}, "--twin and --sensor exclude each other"),
-        ({"sensor": "none"}, "--sensor is none, but there is no sensor file"),
-        ({"camera": "http://127.0.0.1/"}, "--leds is missing: give both --camera and --leds"),
+        ({"camera": "http://127.0.0.1/", "leds": "a"}, "--sensor is missing: give"),
         ({"seconds": 0.0}, "seconds must be > 0, got 0"),
         ({"dwell": 0}, "dwell must be >= 1, got 0"),
-        ({"replay": "a", "record": "b"}, "--record and --replay exclude each other"),
+        ({"replay": "a", "record": "b"}, "--replay excludes --record"),
         ({"save": Path("a.mp4")}, r"a\.mp4 has the suffix '\.mp4', but it must be one of \.png"),
     ],
 )

@@ -2,22 +2,34 @@
 
 import contextlib
 import dataclasses
+import datetime
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
-from PIL import Image, ImageDraw, ImageFont
+import numpy as np
+from PIL import Image
 
-from experiments.shared import drawing
-from experiments.shared.device import Simulated, simulate
+import sts_jax as sts
+from experiments.shared import commissioning, drawing
+from experiments.shared.device import FIELD_OF_VIEW, TwinConfig, make_twin
 from experiments.shared.page import CollectPage
 from experiments.shared.run import Folder
-from experiments.shared.terminal import Terminal, say
+from experiments.shared.terminal import Bar, Terminal, say
 from sts_jax import hardware, storage
-from sts_jax.hardware import AutomaticPerson, EmptyPad, GuideConfig, Person, View
+from sts_jax.hardware import AutomaticPerson, EmptyPad, GuideConfig, Person, View, twin
 
 SHEET = 20  # number of trajectories, the newest ones, that `--sheet` draws by default
 PANEL = 200  # width of an image on the sheet (pixels)
+TWIN_COUNT = 100  # number of confirmed trajectories at which a collection with the twin ends by default
+TWIN_SIZE = 640, 480  # default width and height of the twin's images (pixels)
+TWIN_RATE = 15.0  # frame rate of a collecting twin (frames/s). The guide needs few frames, and each frame costs time
+# Rendered poses per second of a moving object of a collecting twin. They must follow each other fast enough that the
+# guide does not take the object for one at rest.
+MOTION_RATE = 4.0
+LEVELS = (255, 255, 255, 255)  # duty cycles of the twin's LED channels in the tactile stream
+_WAIT_S = 0.1  # time of the computer's clock between two attempts while the session cannot be written (s)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,19 +37,12 @@ class Collect:
     """Guide a person through trajectories, and save images of the held object, and of the object at rest."""
 
     workdir: Folder = Path("runs/real")  # work directory. The trajectories go to its folder `dataset`
+    sensor: Path | None = None  # sensor file of experiments.commission, or its folder
     camera: str | None = None  # path or URL of the camera. None: the camera of the sensor file
     leds: str | None = None  # serial port of the LED controller. None: found by the serial number in the sensor file
     twin: bool = False  # use the digital twin instead of devices. Nobody needs to act, and there is no page
     seed: int = 0  # seed of the twin's object and trajectories
-    sensor: Path | None = None  # sensor file of experiments.commission, or its folder
-    # width and height of the images (pixels). None: those of the sensor file, 640 x 480 with --twin,
-    # otherwise 1640 x 1232
-    size: tuple[int, int] | None = None
-    fourcc: str | None = None  # pixel format of the camera, such as MJPG. None: that of the sensor file or the driver
-    lock: bool = True  # lock the exposure and the white balance of the camera
-    # duty cycles of the four LED channels in the tactile stream, 0 (off) to 255 (always on). None: those of the sensor
-    # file, or 255
-    levels: tuple[int, int, int, int] | None = None
+    size: tuple[int, int] = TWIN_SIZE  # width and height of the twin's images (pixels)
     # stop when the session has this number of confirmed trajectories, earlier ones included. None: stop at 100 with
     # the option --twin, and never without it
     count: int | None = None
@@ -70,85 +75,44 @@ class Review:
 
 def collect(config: Collect) -> None:
     """Connect the sensor, and save trajectories until there are enough of them or the user stops the command."""
-    if config.twin:
-        simulate(of_twin(config))
-        return
-    sensor, empty = device(config)
-    with person(config) as someone:
-        say("connecting. Keep the pad empty, and do not move anything in view")
-        with sensor:
-            origin = hardware.Origin.of(sensor)
-            with hardware.Session(config.workdir / "dataset", origin) as session:
-                if config.sensor is not None:
-                    keep(config.sensor, config.workdir)
-                say(f"{session.folder} has {session.confirmed} confirmed trajectories. New ones are added")
-                try:
-                    hardware.collect(
-                        sensor,
-                        session,
-                        someone,
-                        config=config.guide,
-                        empty=empty,
-                        trusted=config.automatic,
-                        count=config.count,
-                        note=config.note,
-                    )
-                except KeyboardInterrupt:
-                    say("stopped")
-                say(f"{session.confirmed} confirmed trajectories in {session.folder}")
-            if isinstance(sensor.camera, hardware.OpenCVCamera):
-                counts = sensor.camera.statistics
-                say(
-                    f"{counts.frames} frames arrived. {counts.skipped} of them were not read in time, and the camera "
-                    f"lost {counts.dropped} others"
-                )
-
-
-def of_twin(config: Collect) -> Simulated:
-    """Convert the options of `collect` to those of a collection with the twin, and refuse options for devices."""
-    for name in ("camera", "leds", "sensor", "fourcc"):
-        value = getattr(config, name)
-        if value is not None:
-            raise ValueError(f"--{name} is {value}, but no device is used with --twin: leave out --{name} or --twin")
-    if not config.lock:
-        raise ValueError("--no-lock has no effect on the digital twin (--twin): leave out --no-lock or --twin")
-    given = {name: getattr(config, name) for name in ("count", "size", "levels")}
-    options = {name: value for name, value in given.items() if value is not None}
-    return Simulated(config.workdir, seed=config.seed, note=config.note, guide=config.guide, **options)
-
-
-def device(config: Collect) -> tuple[hardware.STS, EmptyPad | None]:
-    """Make the sensor that the options describe, not yet connected, and the look of its empty pad, if it is known."""
     if config.count is not None and config.count < 1:
         raise ValueError(f"--count must be >= 1, got {config.count}")
-    if config.sensor is not None:
-        return commissioned(config, config.sensor)
-    if config.camera is None or config.leds is None:
-        cameras, ports = hardware.find_cameras(), hardware.find_controllers()
-        raise ValueError(
-            f"{'--camera' if config.camera is None else '--leds'} is missing. Cameras found: "
-            f"{', '.join(str(camera) for camera in cameras) or 'none'}. Serial ports found: "
-            f"{', '.join(port.device for port in ports) or 'none'}. Give --camera and --leds, "
-            "or a sensor file with --sensor"
-        )
-    width, height = config.size or (1640, 1232)
-    camera = hardware.CameraConfig(config.camera, width, height, fourcc=config.fourcc, lock=config.lock)
-    return hardware.STS(camera=camera, leds=config.leds, levels=config.levels or (255, 255, 255, 255)), None
+    given = [f"--{name}" for name in ("sensor", "camera", "leds") if getattr(config, name) is not None]
+    if config.twin and given:
+        raise ValueError(f"{given[0]} and --twin exclude each other: leave out one of them")
+    if config.twin:
+        simulate(config)
+    elif config.sensor is None:
+        raise ValueError("--sensor is missing: give the sensor file of `experiments.commission`, or --twin")
+    elif config.size != TWIN_SIZE:
+        raise ValueError(f"--size is {config.size}, but the sensor file {config.sensor} determines the size")
+    else:
+        collect_from(config, config.sensor)
 
 
-def commissioned(config: Collect, file: Path) -> tuple[hardware.STS, EmptyPad | None]:
-    """Make the sensor of a sensor file."""
-    for name, value in (("size", config.size), ("levels", config.levels)):
-        if value is not None:
-            raise ValueError(
-                f"--{name} is {value}, but the sensor file {file} determines this value: leave out --{name} or --sensor"
-            )
-    device = hardware.Device.load(file)
-    camera = device.camera_config(config.camera)
-    camera = dataclasses.replace(camera, lock=config.lock and camera.lock, fourcc=config.fourcc or camera.fourcc)
-    backgrounds = device.backgrounds(file)
-    empty = None if backgrounds is None else hardware.known_pad(*backgrounds)
-    return hardware.STS.from_file(file, camera=camera, leds=config.leds), empty
+def collect_from(config: Collect, file: Path) -> None:
+    """Save trajectories of the sensor of a sensor file, with a person."""
+    sensor = hardware.STS.from_file(file, camera=config.camera, leds=config.leds)
+    backgrounds = hardware.Device.load(file).backgrounds(file)
+    with person(config) as someone:
+        say("connecting. Keep the pad empty, and do not move anything in view")
+        with sensor, hardware.Session(config.workdir / "dataset", hardware.Origin.of(sensor)) as session:
+            keep(file, config.workdir)
+            say(f"{session.folder} has {session.confirmed} confirmed trajectories. New ones are added")
+            try:
+                hardware.collect(
+                    sensor,
+                    session,
+                    someone,
+                    config=config.guide,
+                    empty=None if backgrounds is None else hardware.known_pad(*backgrounds),
+                    trusted=config.automatic,
+                    count=config.count,
+                    note=config.note,
+                )
+            except KeyboardInterrupt:
+                say("stopped")
+            say(f"{session.confirmed} confirmed trajectories in {session.folder}")
 
 
 def keep(file: Path, workdir: Path) -> None:
@@ -171,7 +135,6 @@ def person(config: Collect) -> Iterator[Person]:
         yield Automatic(terminal) if config.automatic else terminal
         return
     with contextlib.closing(CollectPage(config.host, config.port, count=config.count)) as page:
-        page.announce("watch and press the buttons")
         yield Automatic(page) if config.automatic else page
 
 
@@ -190,6 +153,98 @@ class Automatic(AutomaticPerson):
     def action(self) -> hardware.Action | None:
         """The action of the other person, or the automatic one."""
         return self._other.action() or super().action()
+
+
+class Hand(twin.Hand):
+    """Moves the object of a twin as `hardware.collect` instructs, and shows the collection's progress."""
+
+    def __init__(self, device: twin.Twin, session: hardware.Session, bar: Bar, count: int):
+        super().__init__(device, session)
+        self._bar, self._count = bar, count
+        self._problem: str | None = None
+
+    def show(self, view: View) -> None:
+        """Move the object, and show the number of confirmed trajectories, or an error that prevents collecting."""
+        super().show(view)
+        self._bar("collect", view.confirmed, self._count)
+        if view.problem is not None:
+            if self._problem is None:
+                say(view.problem)
+            time.sleep(_WAIT_S)
+        self._problem = view.problem
+
+
+def simulate(config: Collect) -> None:
+    """Collect trajectories of a twin, on its virtual clock, until the work directory has enough of them.
+
+    A twin has a fixed sequence of trajectories for each seed, which an interrupted collection continues.
+    """
+    dataset, count = config.workdir / "dataset", config.count or TWIN_COUNT
+    if (dataset / storage.MANIFEST).exists() and len(hardware.load_recordings(dataset)) >= count:
+        say(f"{dataset} has {count} trajectories already")
+        return
+    with started(config, hardware.next_recording(dataset)) as device:
+        sensor, empty = commissioned(config, device)
+        with hardware.Session(dataset, sensor.origin) as session, Bar() as bar:
+            say(f"{dataset} has {session.confirmed} confirmed trajectories. New ones are added")
+            begun_s = time.monotonic()
+            number = hardware.collect(
+                sensor,
+                session,
+                Hand(device, session, bar, count),
+                config=config.guide,
+                empty=empty,
+                trusted=True,
+                count=count,
+                note=config.note,
+            )
+            bar("collect", count, count)
+        seconds = time.monotonic() - begun_s
+        say(f"{number} trajectories in {seconds:.1f} s, {seconds / number:.2f} s each")
+
+
+def started(config: Collect, first: int) -> twin.Twin:
+    """Make a twin that begins with the trajectory number `first`."""
+    options = TwinConfig(resolution=config.size[::-1], rate=TWIN_RATE, motion_rate=MOTION_RATE, seed=config.seed)
+    return make_twin(options, first=first, prepare=False)
+
+
+def commissioned(config: Collect, device: twin.Twin) -> tuple[twin.VirtualSensor, EmptyPad]:
+    """Connect to a twin with the sensor file of the work directory, which is written first if it is missing."""
+    file, settling = config.workdir / hardware.sensor_file.NAME, None
+    if file.exists():
+        there = hardware.Device.load(file)
+        there.check_identity(camera=twin.CAMERA, leds=device.serial_number)
+        if (there.width, there.height) != config.size:
+            raise ValueError(
+                f"{file} is for images of {there.width} x {there.height} pixels, but --size is {config.size}: change "
+                "it, or choose another --workdir"
+            )
+        settling = hardware.Settling(there.settle_off_s, there.settle_on_s)
+    sensor = twin.VirtualSensor(device, levels=LEVELS, settling=settling)
+    if settling is None:
+        _commission(config, device, sensor)
+    backgrounds = hardware.Device.load(file).backgrounds(file)
+    assert backgrounds is not None, "`_commission` has recorded them"
+    return sensor, hardware.known_pad(*backgrounds)
+
+
+def _commission(config: Collect, device: twin.Twin, sensor: twin.VirtualSensor) -> None:
+    """Record the empty pad of a twin, and write its sensor file."""
+    simulated = sts.Sensor()
+    file = hardware.Device(
+        camera=twin.CAMERA,
+        fps=device.rate,
+        leds=device.serial_number,
+        lens=commissioning.ideal_lens(config.size, FIELD_OF_VIEW, simulated),
+        settle_on_s=sensor.settling.tactile_s,
+        settle_off_s=sensor.settling.visual_s,
+        levels=LEVELS,
+        commissioned=datetime.date.today().isoformat(),
+        lens_from="ideal",
+    )
+    config.workdir.mkdir(parents=True, exist_ok=True)
+    file.save(config.workdir, simulated, commissioning.record_empty(sensor))
 
 
 def review(config: Review) -> None:
@@ -236,25 +291,14 @@ def draw(folder: Path, numbers: tuple[int, ...], path: Path) -> None:
     """Draw trajectories, the newest `SHEET` if there are no numbers, as rows: initial and final visual and tactile."""
     recordings = hardware.load_recordings(folder)
     if unknown := set(numbers) - set(recordings.numbers):
-        raise ValueError(
-            f"{folder} has no confirmed trajectories with the numbers {sorted(unknown)}: give other --numbers"
-        )
+        raise ValueError(f"{folder} has no confirmed trajectories {sorted(unknown)}: give other --numbers")
     if not recordings.numbers:
-        raise ValueError(f"no picture can be drawn, because {folder} has no confirmed trajectory: collect some first")
-    chosen = numbers or recordings.numbers[-SHEET:]
+        raise ValueError(f"{folder} has no confirmed trajectory: collect some first")
     rows = []
-    for number in chosen:
+    for number in numbers or recordings.numbers[-SHEET:]:
         trajectory = recordings[recordings.numbers.index(number)]
         shots = [shot for pair in (trajectory.initial, trajectory.final) for shot in (pair.visual, pair.tactile)]
         height = round(PANEL * shots[0].image.shape[0] / shots[0].image.shape[1])
-        rows.append([cv2.resize(shot.image, (PANEL, height), interpolation=cv2.INTER_AREA) for shot in shots])
-    height, margin, head = rows[0][0].shape[0], 60, 24
-    sheet = Image.new("RGB", (margin + 4 * (PANEL + 4), head + len(rows) * (height + 4)), "white")
-    pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=14)
-    for column, title in enumerate(("initial, visual", "initial, tactile", "final, visual", "final, tactile")):
-        pen.text((margin + column * (PANEL + 4), 4), title, fill="black", font=font)
-    for row, (number, images) in enumerate(zip(chosen, rows, strict=True)):
-        pen.text((6, head + row * (height + 4) + height // 2 - 8), str(number), fill="black", font=font)
-        for column, image in enumerate(images):
-            sheet.paste(Image.fromarray(image), (margin + column * (PANEL + 4), head + row * (height + 4)))
-    drawing.write_picture(path, sheet)
+        row = np.hstack([cv2.resize(shot.image, (PANEL, height), interpolation=cv2.INTER_AREA) for shot in shots])
+        rows.append(cv2.putText(row, str(number), (6, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (255, 255, 0), 2))
+    drawing.write_picture(path, Image.fromarray(np.vstack(rows)))

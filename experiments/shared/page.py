@@ -13,10 +13,8 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import cv2
-import numpy as np
-from jaxtyping import UInt8
 
-from experiments.shared.live import Seen
+from experiments.shared.live import Image, Seen
 from experiments.shared.terminal import say
 from sts_jax.hardware import Action, View, web
 
@@ -27,7 +25,6 @@ _OPEN_S = 2.0  # time since the last request for facts after which the page coun
 _LAST_S = 0.4  # time at the end in which open pages can request the last facts (s)
 _LARGEST = 1000  # largest size of a request's content (bytes)
 
-Image = UInt8[np.ndarray, "height width 3"]
 State = TypeVar("State")  # what a page shows
 
 
@@ -36,29 +33,34 @@ class Page(abc.ABC, Generic[State]):
 
     document: Path  # HTML file of the page
     streams: tuple[str, ...]  # names of the live images. The page loads each from `NAME.mjpg`
+    use = "watch"  # what people can do on the page
 
-    def __init__(self, host: str, port: int):
-        """Start the server in a thread. Port 0 selects a free one."""
+    def __init__(self, host: str, port: int, **constants: Any):
+        """Start the server in a thread, and print the address. Port 0 selects a free one.
+
+        `constants` are facts that do not change, as JSON values.
+        """
         self._changed = threading.Condition()
         self._state: State | None = None
         self._number = 0  # number of changes of the state so far
-        self._ended = False
+        self._facts = {**constants, "ended": False}
         self._asked_s = -float("inf")  # time of the last request for facts, on the clock `time.monotonic` (s)
-        handler = type("Handler", (_Handler,), {"page": self})
-        self._server = web.Server(host, port, handler)
+        self._server = web.Server(host, port, type("Handler", (_Handler,), {"page": self}))
         self.host, self.port = host, self._server.server_port
         self._thread = threading.Thread(target=self._server.serve_forever, name="page", daemon=True)
         self._thread.start()
+        reach = "only this computer" if self._server.is_local else "EVERY computer that reaches this address"
+        say(f"open {self._server.url}/ in a browser. The page listens on {host}, so {reach} can {self.use}")
 
     @abc.abstractmethod
-    def facts(self, state: State | None) -> dict[str, Any]:
+    def facts(self, state: State) -> dict[str, Any]:
         """The content of the page without the images, as a dictionary of JSON values."""
 
     @abc.abstractmethod
     def image(self, state: State, path: str) -> Image | None:
         """The image of a state at a path without suffix, such as `visual`, or None if it has no such image."""
 
-    def pressed(self, state: State | None, content: Any) -> bool:
+    def pressed(self, state: State, content: Any) -> bool:
         """Accept an action of the page, such as a pressed button, or return False."""
         return False
 
@@ -68,36 +70,25 @@ class Page(abc.ABC, Generic[State]):
             self._state, self._number = state, self._number + 1
             self._changed.notify_all()
 
-    def announce(self, what: str) -> None:
-        """Print the address of the page, and who can do there `what`, such as "watch"."""
-        reach = "only this computer" if self._server.is_local else "EVERY computer that reaches this address"
-        say(f"open {self.url} in a browser. The page listens on {self.host}, so {reach} can {what}")
-
-    @property
-    def url(self) -> str:
-        """The address of the page."""
-        return self._server.url + "/"
-
     def newest(self) -> State | None:
         """The newest state, or None before the first one."""
-        with self._changed:
-            return self._state
+        return self._state
 
     def answer(self) -> dict[str, Any]:
-        """The facts and whether the program has ended. The page then counts as open."""
-        self._asked_s = time.monotonic()
-        return {**self.facts(self.newest()), "ended": self._ended}
+        """All facts. The page then counts as open."""
+        self._asked_s, state = time.monotonic(), self._state
+        return {**self._facts, "waiting": state is None, **({} if state is None else self.facts(state))}
 
     def wait(self, last: int) -> int | None:
         """Wait until there were more than `last` changes. Returns their number, or None if the program has ended."""
         with self._changed:
-            self._changed.wait_for(lambda: self._ended or self._number > last)
-            return None if self._ended else self._number
+            self._changed.wait_for(lambda: self._facts["ended"] or self._number > last)
+            return None if self._facts["ended"] else self._number
 
     def close(self) -> None:
         """Show in open pages that the program has ended, and stop the server."""
         with self._changed:
-            self._ended = True
+            self._facts["ended"] = True
             self._changed.notify_all()
         if time.monotonic() - self._asked_s < _OPEN_S:
             time.sleep(_LAST_S)
@@ -129,21 +120,18 @@ class _Handler(web.Handler):
 
     def do_POST(self) -> None:
         """Pass an action of the page to `Page.pressed`."""
-        length = self.headers.get("Content-Length", "")
+        length, state = self.headers.get("Content-Length", ""), self.page.newest()
         with contextlib.suppress(OSError):
             if self.path != "/action" or self.headers.get("X-Collect") != "1":
                 self.send_error(403)
-                return
-            if not length.isdecimal() or int(length) > _LARGEST:
+            elif not length.isdecimal() or int(length) > _LARGEST:
                 self.send_error(400)
-                return
-            try:
-                content = json.loads(self.rfile.read(int(length)))
-            except ValueError:
-                self.send_error(400)
-                return
-            self.send_response(204 if self.page.pressed(self.page.newest(), content) else 409)
-            self.end_headers()
+            else:
+                content = None
+                with contextlib.suppress(ValueError):
+                    content = json.loads(self.rfile.read(int(length)))
+                self.send_response(204 if state is not None and self.page.pressed(state, content) else 409)
+                self.end_headers()
 
     def _image(self, path: str) -> Image | None:
         state = self.page.newest()
@@ -171,16 +159,15 @@ def _jpeg(image: Image) -> bytes:
 
 
 class CollectPage(Page[View]):
-    """The page of `experiments.real collect`, a `hardware.Person`: both streams, the instruction, and buttons."""
+    """The page of `experiments.real collect`, a `hardware.Person`: both streams, the instruction, and buttons.
+
+    The constant `count` is the number of trajectories to reach, or None.
+    """
 
     document = Path(__file__).with_name("page.html")
     streams = ("visual", "tactile")
-
-    def __init__(self, host: str, port: int, *, count: int | None = None):
-        """Start the server. `count` is the number of trajectories to reach, if there is one."""
-        self._count = count
-        self._action: Action | None = None
-        super().__init__(host, port)
+    use = "watch and press the buttons"
+    _action: Action | None = None
 
     def action(self) -> Action | None:
         """The action of the button that was pressed last, or None if no button was pressed since the last call."""
@@ -188,30 +175,24 @@ class CollectPage(Page[View]):
             action, self._action = self._action, None
             return action
 
-    def pressed(self, state: View | None, content: Any) -> bool:
+    def pressed(self, state: View, content: Any) -> bool:
         """Accept the action of a button, unless the page showed an old stage or trajectory. Stop always counts."""
         try:
             action, shown = Action(content["action"]), (content["stage"], content["number"])
         except (KeyError, TypeError, ValueError):
             return False
-        if state is None or (action is not Action.STOP and shown != (state.stage.value, state.number)):
+        if action is not Action.STOP and shown != (state.stage.value, state.number):
             return False
         with self._changed:
             self._action = action
         return True
 
-    def facts(self, state: View | None) -> dict[str, Any]:
+    def facts(self, state: View) -> dict[str, Any]:
         """The instruction and the state of the recording."""
-        if state is None:
-            nothing: dict[str, Any] = {"number": None, "contact": False, "still": False, "problem": None, "ends": []}
-            counts = {"confirmed": 0, "count": self._count}
-            return {"stage": "", "instruction": "Connecting", "age_s": None, **nothing, **counts}
-        pair = state.pair
-        names = ("instruction", "number", "confirmed", "contact", "still", "problem")
+        pair, names = state.pair, ("instruction", "number", "confirmed", "contact", "still", "problem")
         return {
             **{name: getattr(state, name) for name in names},
             "stage": state.stage.value,
-            "count": self._count,
             "ends": [end for end in ("initial", "final") if getattr(state, end) is not None],
             "age_s": None if pair is None else time.monotonic() - max(pair.visual.time_s, pair.tactile.time_s),
         }
@@ -226,31 +207,21 @@ class CollectPage(Page[View]):
 
 
 class LivePage(Page[Seen]):
-    """The page of `experiments.live`: the live images, the predicted images, and facts about the predictions."""
+    """The page of `experiments.live`: the live images, the predicted images, and facts about the predictions.
+
+    The constant `title` names the source and the model.
+    """
 
     document = Path(__file__).with_name("live_page.html")
     streams = ("visual", "tactile", "predicted_visual", "predicted_tactile")
 
-    def __init__(self, host: str, port: int, *, title: str):
-        """Start the server. `title` names the source and the model."""
-        self._title = title
-        super().__init__(host, port)
-
-    def facts(self, state: Seen | None) -> dict[str, Any]:
+    def facts(self, state: Seen) -> dict[str, Any]:
         """The rate, the latency, the contact and the outcomes."""
-        if state is None:
-            return {"title": self._title, "waiting": True}
-        predicted, names = state.predicted, ("note", "images_per_s", "recorded", "rate")
-        return {
-            **{name: getattr(state, name) for name in names},
-            "title": self._title,
-            "waiting": predicted is None,
-            "age_s": time.monotonic() - state.time_s,
-            "latency_ms": None if state.latency_s is None else 1000 * state.latency_s,
-            "contact": None if predicted is None else predicted.contact,
-            "occupied": None if predicted is None else predicted.occupied,
-            "outcomes": [] if predicted is None else predicted.outcomes,
-        }
+        if state.predicted is None:
+            return {"waiting": True}
+        facts = state.predicted._asdict()
+        del facts["visual"], facts["tactile"]
+        return {**facts, "age_s": time.monotonic() - state.time_s}
 
     def image(self, state: Seen, path: str) -> Image | None:
         """The newest image of a stream such as `visual` or `predicted_visual`."""

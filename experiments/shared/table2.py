@@ -9,8 +9,8 @@ import numpy as np
 import tyro
 
 import sts_jax as sts
+from experiments.shared.collecting import Collect, simulate
 from experiments.shared.config import MODELS, TITLES
-from experiments.shared.device import Simulated, simulate
 from experiments.shared.evaluate import identity, record, stale
 from experiments.shared.run import Folder, Job, Stage, train_model
 from experiments.shared.terminal import Bar, say
@@ -82,7 +82,7 @@ def main(args: Train) -> None:
     sts.enable_compilation_cache()
     if args.only in (None, "collect") and (count := missing(config, workdir)):
         say(f"collect: {count} trajectories of the digital twin into {workdir / 'dataset'}")
-        simulate(Simulated(workdir, config.count, config.size))
+        simulate(Collect(workdir, twin=True, count=config.count, size=config.size))
     if args.only == "collect":
         return
     data, folder = read(config, workdir), workdir / args.name
