@@ -39,8 +39,9 @@ def peer(tmp_path):
 @contextlib.contextmanager
 def running(peer, workdir, *options):
     """The command `collect` in a process of its own, and the queue of its lines."""
-    command = [sys.executable, "-m", "experiments.real", "collect", "--workdir", str(workdir), "--camera", peer.url]
-    command += ["--leds", peer.path, "--no-lock", *QUICK, *options]
+    command = [sys.executable, "-m", "experiments.real", "collect", "--workdir", str(workdir), "--headless"]
+    command += ["--automatic", "--sensor", str(sensor_file(peer, workdir / "bench"))]
+    command += ["--leds", peer.path, "--count", "3", *QUICK, *options]
     root = str(Path(__file__).parents[1])
     path = os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])
     lines = queue.Queue()
@@ -86,8 +87,7 @@ def follow(lines, player, until_line=None):
 @pytest.mark.slow
 def test_collecting_is_resumed_after_a_kill(peer, tmp_path):
     player = Player(peer)
-    common = "--headless", "--automatic", "--count", "3"
-    with running(peer, tmp_path, *common, "--size", *(str(n) for n in SIZE)) as (process, lines):
+    with running(peer, tmp_path) as (process, lines):
         follow(lines, player, "[1 of 3]")
         process.kill()
     peer.leds.controller._apply((0, 0, 0, 0))  # the watchdog
@@ -96,8 +96,7 @@ def test_collecting_is_resumed_after_a_kill(peer, tmp_path):
     assert kept == (0,)
     player.peer.camera.spot = None
     player.count = hardware.list_recordings(dataset)[-1].number + 1
-    file = sensor_file(peer, tmp_path / "sensor.json")
-    with running(peer, tmp_path, *common, "--sensor", str(file), "--note", "box") as (process, lines):
+    with running(peer, tmp_path, "--note", "box") as (process, lines):
         seen = follow(lines, player)
         assert process.wait(WAIT_S) == 0, seen
     assert any("has 1 confirmed trajectories" in line for line in seen)
@@ -108,21 +107,13 @@ def test_collecting_is_resumed_after_a_kill(peer, tmp_path):
     assert [trajectory.note for trajectory in read] == ["", "box", "box"]
 
 
-def sensor_file(peer, path):
+def sensor_file(peer, folder):
     """The file of the peer's sensor, with its backgrounds and settling."""
-    device = hardware.Device(
-        camera=peer.url,
-        fps=60.0,
-        leds=peer.leds.controller._serial_number,
-        lens=hardware.Lens.ideal(*SIZE),
-        settle_on_s=0.1,
-        settle_off_s=0.1,
-        levels=(255, 255, 255, 255),
-        commissioned="2026-05-31",
-    )
+    serial_number, levels = peer.leds.controller._serial_number, (255, 255, 255, 255)
+    device = hardware.Device(peer.url, 60.0, serial_number, hardware.Lens.ideal(*SIZE), 0.1, 0.1, levels, "2026-05-31")
     dark, lit = (np.full((SIZE[1], SIZE[0], 3), level, np.uint8) for level in (DARK, LIT))
-    device.save(path, sts.Sensor(), (dark, lit))
-    return path
+    device.save(folder, sts.Sensor(), (dark, lit))
+    return folder
 
 
 def ask(page, method, path, body=None, **headers):
@@ -155,7 +146,7 @@ def page():
 
 def test_the_page_shows_a_view(page):
     assert b"<title>Collect trajectories</title>" in ask(page, "GET", "/")[1]
-    assert json.loads(ask(page, "GET", "/view")[1])["instruction"] == "Connecting"
+    assert json.loads(ask(page, "GET", "/view")[1]) == {"count": 5, "ended": False, "waiting": True}
     assert ask(page, "GET", "/end/initial/visual.jpg")[0] == 404
     page.show(view())
     facts = json.loads(ask(page, "GET", "/view")[1])
@@ -273,13 +264,12 @@ def test_reviewing(workdir, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({}, "--camera is missing. Cameras found: .* Serial ports found: "),
-        ({"camera": "http://127.0.0.1:1/video"}, "--leds is missing"),
-        ({"camera": "a", "leds": "b", "count": 0}, "count must be >= 1, got 0"),
-        ({"camera": "a", "leds": "b", "levels": (0, 0, 0, 0)}, "at least one above 0"),
+        ({}, "--sensor is missing: give the sensor file"),
+        ({"sensor": Path("none.json"), "count": 0}, "count must be >= 1, got 0"),
         ({"sensor": Path("none.json")}, "none.json"),
-        ({"sensor": Path("none.json"), "size": (640, 480)}, "--size is .*, but the sensor file none.json determines"),
-        ({"camera": "http://127.0.0.1:1/video", "leds": "/dev/none"}, "/dev/none"),
+        ({"sensor": Path("none.json"), "size": (320, 240)}, "--size is .*, but the sensor file none.json determines"),
+        ({"twin": True, "camera": "/dev/video0"}, "--camera and --twin exclude each other"),
+        ({"twin": True, "size": (0, 480)}, "at least 1 pixel"),
     ],
 )
 def test_bad_options_are_named(tmp_path, options, message):

@@ -8,7 +8,7 @@ import pytest
 import sts_jax as sts
 from experiments import real
 from experiments.shared import collecting
-from experiments.shared.device import Hand, Simulated, commissioned, simulate, started
+from experiments.shared.collecting import Collect, Hand, commissioned, simulate, started
 from sts_jax import hardware
 from sts_jax.hardware import twin
 
@@ -24,7 +24,7 @@ def ends(workdir):
 @pytest.mark.slow
 def test_an_interrupted_collection_of_the_twin_equals_an_uninterrupted_one(tmp_path, monkeypatch, capsys):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
-    simulate(Simulated(whole, 5, **SMALL))
+    simulate(Collect(whole, count=5, **SMALL))
     show = Hand.show
 
     def interrupted(self, view):
@@ -34,10 +34,10 @@ def test_an_interrupted_collection_of_the_twin_equals_an_uninterrupted_one(tmp_p
 
     monkeypatch.setattr(Hand, "show", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        simulate(Simulated(parts, 5, **SMALL))
+        simulate(Collect(parts, count=5, **SMALL))
     monkeypatch.undo()
     kept = {path: path.read_bytes() for path in parts.rglob("*.png")}
-    real.main(real.Collect(parts, twin=True, count=5, **SMALL))
+    real.main(Collect(parts, twin=True, count=5, **SMALL))
     assert all(path.read_bytes() == content for path, content in kept.items())
 
     one, two = ends(whole), ends(parts)
@@ -48,20 +48,19 @@ def test_an_interrupted_collection_of_the_twin_equals_an_uninterrupted_one(tmp_p
         assert min(others) > 2 * np.abs(images - one[number]).mean()
 
     capsys.readouterr()
-    real.main(real.Collect(parts, twin=True, count=5, **SMALL))
+    real.main(Collect(parts, twin=True, count=5, **SMALL))
     assert "has 5 trajectories already" in capsys.readouterr().err
     for options, message in (
         ({"seed": 1}, "TWIN1"),
         ({"size": (320, 240)}, "is for images of 240 x 180 pixels"),
-        ({"levels": (9, 9, 9, 9)}, "levels"),
     ):
         with pytest.raises(SystemExit, match=message):
-            real.main(real.Collect(parts, twin=True, count=6, **{**SMALL, **options}))
+            real.main(Collect(parts, twin=True, count=6, **{**SMALL, **options}))
 
 
 @pytest.mark.slow
 def test_the_sensor_file_of_the_twin_rectifies_to_the_simulated_view(tmp_path):
-    config = Simulated(tmp_path, 1, size=(320, 240))
+    config = Collect(tmp_path, size=(320, 240))
     with started(config, 0) as device:
         sensor, empty = commissioned(config, device)
         pair = sensor.read()
@@ -82,21 +81,6 @@ def test_the_sensor_file_of_the_twin_rectifies_to_the_simulated_view(tmp_path):
     side = 2 * float(sts.Sensor().camera.distance) * 0.75
     middle = (np.array([columns.mean(), rows.mean()]) + 0.5) / 96 * side - side / 2
     assert math.dist(middle, pose[:2]) < 0.035
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"camera": "/dev/video0"}, "--camera is /dev/video0, but no device is used with --twin: leave out --camera"),
-        ({"lock": False}, r"--no-lock has no effect on the digital twin \(--twin\): leave out"),
-        ({"levels": (0, 0, 0, 256)}, r"levels must be .* got \(0, 0, 0, 256\)"),
-        ({"count": 0}, "count must be >= 1, got 0"),
-        ({"size": (0, 480)}, "at least 1 pixel"),
-    ],
-)
-def test_bad_options_of_the_twin_are_named(tmp_path, options, message):
-    with pytest.raises(SystemExit, match=message):
-        real.main(real.Collect(tmp_path, twin=True, **options))
 
 
 @pytest.fixture
@@ -150,4 +134,4 @@ def test_a_work_directory_of_a_device_is_not_continued_by_the_twin(file, tmp_pat
         twin.Twin(twin.Picture(np.zeros((24, 32, 3)), np.ones((24, 32, 3)))) as device,
         pytest.raises(ValueError, match="LED controller TWIN0"),
     ):
-        commissioned(Simulated(workdir, size=(32, 24)), device)
+        commissioned(Collect(workdir, size=(32, 24)), device)
