@@ -5,25 +5,18 @@
     python -m experiments.real --preset smoke     # a short run of every stage, for tests
 
     python -m experiments.real collect --sensor bench --count 500   # shows a page in the browser
-    python -m experiments.real collect --camera /dev/v4l/by-id/... --leds /dev/ttyACM0    # without a sensor file
     python -m experiments.real collect --twin --workdir runs/twin   # the digital twin, on a virtual clock
     python -m experiments.real review                       # lists the trajectories
     python -m experiments.real review --sheet review.png    # draws the last 20
     python -m experiments.real review --discard 3 17
 
-The default sub-command is `train`. This sub-command trains three models on the trajectories in `WORKDIR/dataset`. The
-models are called "VAE visual only", "VAE tactile only" and "MVAE without pose". The models learn to predict the images
-of the object at rest from the images of the held object. Results go to `WORKDIR/table2`. A work directory cannot
-contain trajectories of both a device and the twin, so give the twin a separate `--workdir`.
+The default sub-command `train` trains "VAE visual only", "VAE tactile only" and "MVAE without pose" on the trajectories
+in `WORKDIR/dataset`, to predict the images of the object at rest from those of the held object. Results go to
+`WORKDIR/table2`. A work directory cannot contain trajectories of both a device and the twin.
 
-`--sensor` is the sensor file of `experiments.commission`. The sensor file contains the lens, and names the images of
-the empty pad, which are in the same folder. Training needs the lens and these images.
-
-`collect` guides a person through trajectories: place the object in an unstable pose, hold the object, release the
-object, and wait until the object rests. A trajectory has two pairs of a visual and a tactile image. The first pair
-shows the held object, and the second pair shows the object at rest. Each pair is saved immediately, raw and uncropped,
-into `WORKDIR/dataset`. Confirmed trajectories survive an interruption. After an interruption, the same command
-continues with the next trajectory.
+`collect` guides a person: place the object in an unstable pose, hold it, release it, and wait until it rests. A visual
+and a tactile image are saved at once, raw and uncropped, when the object is held and when it rests. After an
+interruption, the same command continues. `--sensor` is the sensor file of `experiments.commission`.
 """
 
 import dataclasses

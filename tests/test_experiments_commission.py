@@ -185,16 +185,7 @@ def test_an_interrupted_run_resumes_and_writes_a_file_that_opens_the_sensor(peer
 
 
 def test_another_controller_on_the_port_is_refused(tmp_path, peer):
-    device = Device(
-        camera=peer.url,
-        fps=30.0,
-        leds="OTHER",
-        lens=TRUE,
-        settle_on_s=0.1,
-        settle_off_s=0.1,
-        levels=(255, 255, 255, 255),
-        commissioned="2026-05-31",
-    )
+    device = Device(peer.url, 30.0, "OTHER", TRUE, 0.1, 0.1, (255, 255, 255, 255), "2026-05-31")
     device.save(tmp_path / "bench", sts.Sensor())
     with pytest.raises(ValueError, match=r"LED controller OTHER, but .* LED controller EMULATED"):
         hardware.STS.from_file(tmp_path / "bench", leds=peer.path).connect()
@@ -235,6 +226,8 @@ def test_a_view_that_the_camera_does_not_see_is_refused(config):
         hardware.check_view(shifted, PINHOLE)
     with pytest.raises(hardware.CalibrationError, match="larger field of view"):
         commission.main(dataclasses.replace(config, ideal_lens=90.0))
+    corners = hardware.FoundCorners(np.arange(2), np.array([[1.0, 1.0], [WIDTH - 1.0, HEIGHT / 2]]))
+    assert hardware.covered([corners], (WIDTH, HEIGHT)) == ("top left", "middle right")
 
 
 def test_few_or_wrong_pictures_name_their_folder(config, pictures):
@@ -288,12 +281,6 @@ def test_a_deleted_picture_of_the_board_on_the_pad_is_taken_again_first(config, 
     np.testing.assert_array_equal(corners["000.png"].pixels, expected)
 
 
-def test_covered_parts_are_named():
-    corners = hardware.FoundCorners(np.arange(2), np.array([[1.0, 1.0], [WIDTH - 1.0, HEIGHT / 2]]))
-    assert hardware.covered([corners], (WIDTH, HEIGHT)) == ("top left", "middle right")
-    assert hardware.covered([], (WIDTH, HEIGHT)) == ()
-
-
 # ---- The exposure
 
 
@@ -317,23 +304,14 @@ class Metered(hardware.OpenCVCamera):
         return hardware.Captured(image, 0.0, 0)
 
 
-@pytest.fixture
-def no_lag(monkeypatch):
+@pytest.mark.parametrize(("light", "limit"), [(0.8, None), (1.3, None), (40.0, None), (0.1, 300), (400.0, 1)])
+def test_exposure_is_bright_and_not_saturated_within_the_limits(monkeypatch, light, limit):
     monkeypatch.setattr(hardware.sts, "LAG_S", 0.0)
-
-
-@pytest.mark.parametrize("light", [0.8, 1.3, 40.0])
-def test_exposure_is_bright_and_not_saturated(no_lag, light):
     found = hardware.choose_exposure(Metered(light), longest=300)
-    assert 170 <= found.brightness <= 230
-    assert found.brightness == pytest.approx(found.exposure * light, abs=1)
-
-
-def test_exposure_stops_at_the_limits(no_lag):
-    assert hardware.choose_exposure(Metered(0.1), longest=300) == (300, 30)
-    assert hardware.choose_exposure(Metered(400.0), longest=300) == (1, 255)
+    assert found.brightness == pytest.approx(min(found.exposure * light, 255), abs=1)
+    assert 170 <= found.brightness <= 230 if limit is None else found.exposure == limit
     with pytest.raises(hardware.CameraError, match="does not support a manual exposure"):
-        hardware.choose_exposure(Metered(1.0, settable=False), longest=300)
+        hardware.choose_exposure(Metered(light, settable=False), longest=300)
 
 
 class Video:
@@ -425,19 +403,6 @@ def test_devices_are_listed(config, monkeypatch, capsys):
 def test_bad_options_are_named(config, changes, message):
     with pytest.raises(ValueError, match=message):
         commission.main(dataclasses.replace(config, **changes))
-
-
-def test_a_missing_port_and_another_device_are_named(config, tmp_path, monkeypatch):
-    measure_briefly(monkeypatch)
-    config = dataclasses.replace(config, ideal_lens=160.0, every=0.0)
-    with pytest.raises(hardware.LedError, match="cannot open"):
-        commission.main(config)
-    other = Peer(tmp_path / "leds", talk=b"$GPGGA,1,2\r\n")
-    try:
-        with pytest.raises(hardware.LedError):
-            commission.main(config)
-    finally:
-        other.vanish()
 
 
 def test_a_missing_keyboard_is_named(monkeypatch):

@@ -1,7 +1,7 @@
 """`experiments.live`: what is shown, at which rate, and from which images."""
 
+import contextlib
 import dataclasses
-import http.client
 import json
 import socket
 import threading
@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from led_simulator import WAIT_S
+from page_client import ask, stream
 from session_writer import ORIGIN, SIZE, shot
 
 import sts_jax as sts
@@ -166,39 +167,34 @@ def seen(level=90):
     return Seen(image, image, time.monotonic(), found)
 
 
-def ask(page, path, host=None):
-    connection = http.client.HTTPConnection(page.host, page.port, timeout=WAIT_S)
-    try:
-        connection.request("GET", path, headers={"Host": host or f"127.0.0.1:{page.port}"})
-        answer = connection.getresponse()
-        return answer.status, answer.read()
-    finally:
-        connection.close()
+@pytest.fixture
+def page():
+    with contextlib.closing(LivePage("127.0.0.1", 0, title="A twin")) as made:
+        yield made
 
 
-def test_the_page_shows_a_state_and_only_to_its_own_name():
-    page = LivePage("127.0.0.1", 0, title="A twin")
-    try:
-        assert b"<title>Live prediction</title>" in ask(page, "/")[1]
-        assert json.loads(ask(page, "/view")[1]) == {"title": "A twin", "waiting": True, "ended": False}
-        page.show(seen())
-        facts = json.loads(ask(page, "/view")[1])
-        expected = {"rate": 12.0, "latency_ms": 80.0, "contact": True, "occupied": True, "waiting": False}
-        assert {name: facts[name] for name in expected} == expected
-        assert facts["outcomes"] == [["rests", 0.9], ["fell off", 0.1]]
-        assert ask(page, "/view", "evil.example")[0] == 403
-        for path in ("/other.mjpg", "/outcomes.jpg", "/predicted_outcomes.jpg"):
-            assert ask(page, path)[0] == 404
-        connection = http.client.HTTPConnection(page.host, page.port, timeout=WAIT_S)
-        connection.request("GET", "/predicted_tactile.mjpg")
-        answer = connection.getresponse()
-        page.show(seen())
-        size = int([answer.readline() for _ in range(4)][2].split(b":")[1])
-        image = cv2.imdecode(np.frombuffer(answer.read(size), np.uint8), cv2.IMREAD_COLOR)
+def test_the_page_shows_a_state_and_only_to_its_own_name(page):
+    assert b"<title>Live prediction</title>" in ask(page, "GET", "/")[1]
+    assert json.loads(ask(page, "GET", "/view")[1]) == {"title": "A twin", "waiting": True, "ended": False}
+    page.show(seen())
+    facts = json.loads(ask(page, "GET", "/view")[1])
+    assert 0 <= facts.pop("age_s") < WAIT_S
+    assert facts == {
+        **{"title": "A twin", "ended": False, "waiting": False, "contact": True, "occupied": True},
+        **{"rate": 12.0, "latency_ms": 80.0, "outcomes": [["rests", 0.9], ["fell off", 0.1]]},
+    }
+    assert ask(page, "GET", "/view", Host="evil.example")[0] == 403
+    for path in ("/other.mjpg", "/outcomes.jpg", "/predicted_outcomes.jpg"):
+        assert ask(page, "GET", path)[0] == 404
+    for jpeg in stream(page, "/predicted_tactile.mjpg", [seen(), seen()]):
+        image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
         assert abs(float(image.mean()) - 92) < 1
-        connection.close()
-    finally:
-        page.close()
+
+
+def test_silent_connections_are_closed(page, monkeypatch):
+    monkeypatch.setattr("experiments.shared.page._Handler.timeout", 0.05)
+    with socket.create_connection((page.host, page.port), timeout=WAIT_S) as connection:
+        assert connection.recv(1) == b""
 
 
 def test_a_sensor_file_without_backgrounds_is_refused(tmp_path):
@@ -244,13 +240,3 @@ def test_a_replay_with_a_model_of_the_library(tmp_path, capsys):
     assert height < written.shape[0] <= 6 * height
     live.main(dataclasses.replace(config, save=None, loop=False, seconds=None, speed=20.0))
     assert "the replay has ended" in capsys.readouterr().err
-
-
-def test_silent_connections_are_closed(monkeypatch):
-    monkeypatch.setattr("experiments.shared.page._Handler.timeout", 0.05)
-    page = LivePage("127.0.0.1", 0, title="A twin")
-    try:
-        with socket.create_connection((page.host, page.port), timeout=WAIT_S) as connection:
-            assert connection.recv(1) == b""
-    finally:
-        page.close()

@@ -1,10 +1,8 @@
 """The commands `real collect` and `real review`, against a sensor's devices without a sensor."""
 
 import contextlib
-import http.client
 import json
 import os
-import queue
 import subprocess
 import sys
 import threading
@@ -13,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from led_simulator import WAIT_S
+from page_client import ask, stream
 from player import Player
 from session_writer import ORIGIN, pair
 from test_hardware_collecting import check
@@ -26,8 +25,6 @@ from experiments.shared.terminal import Terminal
 from sts_jax import hardware
 from sts_jax.hardware import Action, Stage
 
-QUICK = ["--guide.empty-s", "0.2", "--guide.hold-s", "0.2", "--guide.rest-s", "0.4"]
-
 
 @pytest.fixture
 def peer(tmp_path):
@@ -36,70 +33,43 @@ def peer(tmp_path):
     made.stop()
 
 
-@contextlib.contextmanager
-def running(peer, workdir, *options):
-    """The command `collect` in a process of its own, and the queue of its lines."""
+def run(peer, player, workdir, *options, until_line=None):
+    """Play what the command `collect` asks for, until it ends, or kill it after a line. All lines and the exit code."""
     command = [sys.executable, "-m", "experiments.real", "collect", "--workdir", str(workdir), "--headless"]
-    command += ["--automatic", "--sensor", str(sensor_file(peer, workdir / "bench"))]
-    command += ["--leds", peer.path, "--count", "3", *QUICK, *options]
-    root = str(Path(__file__).parents[1])
-    path = os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])
-    lines = queue.Queue()
-    process = subprocess.Popen(
-        command,
-        stdin=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-        cwd=root,
-        env={**os.environ, "PYTHONPATH": path},
-    )
-
-    def read():
-        for line in process.stderr:
-            lines.put(line.rstrip())
-        lines.put(None)
-
-    thread = threading.Thread(target=read)
-    thread.start()
-    try:
-        yield process, lines
-    finally:
-        process.kill()
-        process.wait()
-        thread.join()
-        process.stderr.close()
-
-
-def follow(lines, player, until_line=None):
-    """Play what the printed lines ask for, until the process ends or prints something. All lines."""
+    command += ["--automatic", "--sensor", str(sensor_file(peer, workdir / "bench")), "--leds", peer.path]
+    command += ["--count", "3", "--guide.empty-s", "0.2", "--guide.hold-s", "0.2", "--guide.rest-s", "0.4", *options]
     words = {"Take everything off": Stage.CLEAR, "Place the": Stage.PLACE, "Release the": Stage.RELEASE}
-    seen = []
-    while (line := lines.get(timeout=WAIT_S)) is not None:
-        seen.append(line)
-        for text, stage in words.items():
-            if text in line:
-                player.follow(stage)
-        if until_line is not None and until_line in line:
-            break
-    return seen
+    root, lines, pipe = Path(__file__).parents[1], [], subprocess.PIPE
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")])}
+    with subprocess.Popen(
+        command, stdin=subprocess.DEVNULL, stderr=pipe, text=True, cwd=root, env=environment
+    ) as process:
+        timer = threading.Timer(10 * WAIT_S, process.kill)
+        timer.start()
+        for line in process.stderr:
+            lines.append(line)
+            for text, stage in words.items():
+                if text in line:
+                    player.follow(stage)
+            if until_line is not None and until_line in line:
+                process.kill()
+        timer.cancel()
+    return lines, process.returncode
 
 
 @pytest.mark.slow
 def test_collecting_is_resumed_after_a_kill(peer, tmp_path):
     player = Player(peer)
-    with running(peer, tmp_path) as (process, lines):
-        follow(lines, player, "[1 of 3]")
-        process.kill()
+    run(peer, player, tmp_path, until_line="[1 of 3]")
     peer.leds.controller._apply((0, 0, 0, 0))  # the watchdog
     dataset = tmp_path / "dataset"
     kept = hardware.load_recordings(dataset).numbers
     assert kept == (0,)
     player.peer.camera.spot = None
     player.count = hardware.list_recordings(dataset)[-1].number + 1
-    with running(peer, tmp_path, "--note", "box") as (process, lines):
-        seen = follow(lines, player)
-        assert process.wait(WAIT_S) == 0, seen
-    assert any("has 1 confirmed trajectories" in line for line in seen)
+    lines, code = run(peer, player, tmp_path, "--note", "box")
+    assert code == 0, lines
+    assert any("has 1 confirmed trajectories" in line for line in lines)
     read = hardware.load_recordings(dataset)
     assert len(read) == 3
     for trajectory in read:
@@ -116,18 +86,6 @@ def sensor_file(peer, folder):
     return folder
 
 
-def ask(page, method, path, body=None, **headers):
-    connection = http.client.HTTPConnection(page.host, page.port, timeout=WAIT_S)
-    try:
-        connection.request(
-            method, path, None if body is None else json.dumps(body), {"Host": f"127.0.0.1:{page.port}", **headers}
-        )
-        answer = connection.getresponse()
-        return answer.status, answer.read()
-    finally:
-        connection.close()
-
-
 def view(stage=Stage.REVIEW, number=0, **changes):
     taken = pair(0, "initial")
     values = {
@@ -139,9 +97,8 @@ def view(stage=Stage.REVIEW, number=0, **changes):
 
 @pytest.fixture
 def page():
-    made = CollectPage("127.0.0.1", 0, count=5)
-    yield made
-    made.close()
+    with contextlib.closing(CollectPage("127.0.0.1", 0, count=5)) as made:
+        yield made
 
 
 def test_the_page_shows_a_view(page):
@@ -159,20 +116,9 @@ def test_the_page_shows_a_view(page):
 
 
 def test_the_page_streams_each_pair_once(page):
-    connection = http.client.HTTPConnection(page.host, page.port, timeout=WAIT_S)
-    connection.request("GET", "/tactile.mjpg")
-    answer = connection.getresponse()
-    images = []
-    for _ in range(3):
-        page.show(view())
-        assert answer.readline() == b"--frame\r\n"
-        answer.readline()
-        size = int(answer.readline().split(b":")[1])
-        answer.readline()
-        images.append(answer.read(size))
-        assert answer.readline() == b"\r\n"
-    assert all(image.startswith(b"\xff\xd8") and image.endswith(b"\xff\xd9") for image in images)
-    connection.close()
+    for jpeg in stream(page, "/tactile.mjpg", [view() for _ in range(3)]):
+        assert jpeg.startswith(b"\xff\xd8")
+        assert jpeg.endswith(b"\xff\xd9")
 
 
 def test_buttons_count_only_for_the_stage_that_was_shown(page):

@@ -223,28 +223,23 @@ def commissioned(config: Collect, device: twin.Twin) -> tuple[twin.VirtualSensor
         settling = hardware.Settling(there.settle_off_s, there.settle_on_s)
     sensor = twin.VirtualSensor(device, levels=LEVELS, settling=settling)
     if settling is None:
-        _commission(config, device, sensor)
+        simulated = sts.Sensor()
+        made = hardware.Device(
+            camera=twin.CAMERA,
+            fps=device.rate,
+            leds=device.serial_number,
+            lens=commissioning.ideal_lens(config.size, FIELD_OF_VIEW, simulated),
+            settle_on_s=sensor.settling.tactile_s,
+            settle_off_s=sensor.settling.visual_s,
+            levels=LEVELS,
+            commissioned=datetime.date.today().isoformat(),
+            lens_from="ideal",
+        )
+        config.workdir.mkdir(parents=True, exist_ok=True)
+        made.save(config.workdir, simulated, commissioning.record_empty(sensor))
     backgrounds = hardware.Device.load(file).backgrounds(file)
-    assert backgrounds is not None, "`_commission` has recorded them"
+    assert backgrounds is not None, "this function has recorded them"
     return sensor, hardware.known_pad(*backgrounds)
-
-
-def _commission(config: Collect, device: twin.Twin, sensor: twin.VirtualSensor) -> None:
-    """Record the empty pad of a twin, and write its sensor file."""
-    simulated = sts.Sensor()
-    file = hardware.Device(
-        camera=twin.CAMERA,
-        fps=device.rate,
-        leds=device.serial_number,
-        lens=commissioning.ideal_lens(config.size, FIELD_OF_VIEW, simulated),
-        settle_on_s=sensor.settling.tactile_s,
-        settle_off_s=sensor.settling.visual_s,
-        levels=LEVELS,
-        commissioned=datetime.date.today().isoformat(),
-        lens_from="ideal",
-    )
-    config.workdir.mkdir(parents=True, exist_ok=True)
-    file.save(config.workdir, simulated, commissioning.record_empty(sensor))
 
 
 def review(config: Review) -> None:

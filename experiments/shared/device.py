@@ -38,7 +38,6 @@ class TwinConfig:
 
     # class of the object, one of sts_jax.objects.CATEGORIES
     object_class: Annotated[str, tyro.conf.arg(name="class")] = "camera"
-    sensor: Path | None = None  # file with the sensor's constants, written by Sensor.save. None: the paper's sensor
     seed: int = 0  # seed of the object, the trajectories and the noise
     # rendered poses per second of a moving object. None: 10 up to 640 x 480 pixels, fewer for larger frames
     motion_rate: float | None = None
@@ -57,7 +56,7 @@ def make_twin(config: TwinConfig, *, first: int = 0, prepare: bool = True) -> tw
     """Make a twin that begins with the trajectory number `first`, and prepare its first images."""
     if min(config.resolution) < 1:
         raise ValueError(f"--resolution must be at least 1 pixel high and wide, got {config.resolution}")
-    sensor = sts.Sensor() if config.sensor is None else sts.Sensor.load(config.sensor)
+    sensor = sts.Sensor()
     scene = twin.ObjectScene(
         sts.objects.make(jax.random.key(config.seed), config.object_class),
         sensor=sensor,

@@ -17,23 +17,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, UInt8
-from PIL import Image as Pictures
-from PIL import ImageDraw, ImageFont
 
 import sts_jax as sts
 from sts_jax import hardware
 from sts_jax.hardware import guide
 
 SIDE = 384  # side of the images that are shown (pixels)
-_KEPT = 4096  # number of latencies from which the median is computed
-_RECENT = 40  # number of predictions from which their rate is computed
+_RECENT = 400  # number of predictions from which their rate and latency are computed
 _OCCUPIED = 8.0  # difference of a block of the visual image from the empty pad that counts as a change, of 255
 _BLOCKS = 3  # number of changed blocks that show an object
 
 _SMALL = 240  # side of an image in a panel (pixels)
-_HEAD = 24  # height of the titles (pixels)
-_TEXT = 220  # width of the text (pixels)
-_TITLES = ("visual, now", "tactile, now", "visual, predicted at rest", "tactile, predicted at rest")
+_LINE = 24  # height of a line of text (pixels)
 
 Image = UInt8[np.ndarray, "height width 3"]
 
@@ -66,17 +61,14 @@ class Seen(NamedTuple):
 
 
 def panel(seen: Seen) -> Image:
-    """Draw the live and the predicted images, and the lines of text, in one row."""
+    """Draw the live images, the predicted images and the lines of text in one row."""
     assert seen.predicted is not None
     images = seen.visual, seen.tactile, seen.predicted.visual, seen.predicted.tactile
-    sheet = Pictures.new("RGB", (4 * _SMALL + _TEXT, _HEAD + _SMALL), "white")
-    pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=14)
-    for column, (title, image) in enumerate(zip(_TITLES, images, strict=True)):
-        pen.text((column * _SMALL + 2, 3), title, fill="black", font=font)
-        small = cv2.resize(image, (_SMALL, _SMALL), interpolation=cv2.INTER_AREA)
-        sheet.paste(Pictures.fromarray(small), (column * _SMALL, _HEAD))
-    pen.text((4 * _SMALL + 8, _HEAD), "\n".join(seen.predicted.lines()), fill="black", font=font)
-    return np.asarray(sheet)
+    text = np.full((_SMALL, _SMALL, 3), 255, np.uint8)
+    for number, line in enumerate(seen.predicted.lines(), 1):
+        cv2.putText(text, line, (8, number * _LINE), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
+    small = [cv2.resize(image, (_SMALL, _SMALL), interpolation=cv2.INTER_AREA) for image in images]
+    return np.hstack([*small, text])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -138,8 +130,8 @@ class Live:
         self._empty = hardware.known_pad(*views.empty)
         self.newest: Predicted | None = None  # the newest prediction
         self.made = self.offered = 0  # numbers of predictions and of pairs so far
-        self._times_s: collections.deque[float] = collections.deque(maxlen=_RECENT)  # times of the last predictions
-        self._latencies_s: collections.deque[float] = collections.deque(maxlen=_KEPT)
+        # times and latencies of the last predictions (s)
+        self._recent: collections.deque[tuple[float, float]] = collections.deque(maxlen=_RECENT)
         self._waiting: collections.deque[tuple[hardware.Shot, hardware.Shot]] = collections.deque(maxlen=1)
         self._changed, self._stopped = threading.Event(), False
         self._error: Exception | None = None
@@ -170,11 +162,11 @@ class Live:
                 if self._waiting:
                     visual, tactile = self._waiting.pop()
                     predicted = self._predict(visual, tactile)
-                    self._times_s.append(time.monotonic())
-                    self._latencies_s.append(self._times_s[-1] - max(visual.time_s, tactile.time_s))
-                    span_s = self._times_s[-1] - self._times_s[0]
-                    rate = (len(self._times_s) - 1) / span_s if span_s > 0 else 0.0
-                    latency_ms = 1000 * statistics.median(self._latencies_s)
+                    now_s = time.monotonic()
+                    self._recent.append((now_s, now_s - max(visual.time_s, tactile.time_s)))
+                    times_s, latencies_s = zip(*self._recent, strict=True)
+                    rate = (len(times_s) - 1) / max(now_s - times_s[0], 1e-3)
+                    latency_ms = 1000 * statistics.median(latencies_s)
                     self.newest = predicted._replace(rate=rate, latency_ms=latency_ms)
                     self.made += 1
         except Exception as error:  # the next call of `offer` raises this error

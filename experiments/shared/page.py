@@ -21,7 +21,6 @@ from sts_jax.hardware import Action, View, web
 _WIDEST = 820  # largest width of the images in the page (pixels)
 _QUALITY = 80  # JPEG quality
 _INTERVAL_S = 0.1  # time between two images of a stream (s)
-_OPEN_S = 2.0  # time since the last request for facts after which the page counts as closed (s)
 _LAST_S = 0.4  # time at the end in which open pages can request the last facts (s)
 _LARGEST = 1000  # largest size of a request's content (bytes)
 
@@ -41,10 +40,9 @@ class Page(abc.ABC, Generic[State]):
         `constants` are facts that do not change, as JSON values.
         """
         self._changed = threading.Condition()
-        self._state: State | None = None
+        self.state: State | None = None  # the newest state, or None before the first one
         self._number = 0  # number of changes of the state so far
         self._facts = {**constants, "ended": False}
-        self._asked_s = -float("inf")  # time of the last request for facts, on the clock `time.monotonic` (s)
         self._server = web.Server(host, port, type("Handler", (_Handler,), {"page": self}))
         self.host, self.port = host, self._server.server_port
         self._thread = threading.Thread(target=self._server.serve_forever, name="page", daemon=True)
@@ -67,16 +65,12 @@ class Page(abc.ABC, Generic[State]):
     def show(self, state: State) -> None:
         """Update the images and all other values in all open pages."""
         with self._changed:
-            self._state, self._number = state, self._number + 1
+            self.state, self._number = state, self._number + 1
             self._changed.notify_all()
 
-    def newest(self) -> State | None:
-        """The newest state, or None before the first one."""
-        return self._state
-
     def answer(self) -> dict[str, Any]:
-        """All facts. The page then counts as open."""
-        self._asked_s, state = time.monotonic(), self._state
+        """All facts."""
+        state = self.state
         return {**self._facts, "waiting": state is None, **({} if state is None else self.facts(state))}
 
     def wait(self, last: int) -> int | None:
@@ -90,8 +84,7 @@ class Page(abc.ABC, Generic[State]):
         with self._changed:
             self._facts["ended"] = True
             self._changed.notify_all()
-        if time.monotonic() - self._asked_s < _OPEN_S:
-            time.sleep(_LAST_S)
+        time.sleep(_LAST_S)
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
@@ -120,7 +113,7 @@ class _Handler(web.Handler):
 
     def do_POST(self) -> None:
         """Pass an action of the page to `Page.pressed`."""
-        length, state = self.headers.get("Content-Length", ""), self.page.newest()
+        length, state = self.headers.get("Content-Length", ""), self.page.state
         with contextlib.suppress(OSError):
             if self.path != "/action" or self.headers.get("X-Collect") != "1":
                 self.send_error(403)
@@ -134,7 +127,7 @@ class _Handler(web.Handler):
                 self.end_headers()
 
     def _image(self, path: str) -> Image | None:
-        state = self.page.newest()
+        state = self.page.state
         return None if state is None else self.page.image(state, path)
 
     def _stream(self, stream: str) -> None:
