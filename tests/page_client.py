@@ -16,7 +16,7 @@ def ask(page, method, path, body=None, **headers):
         return answer.status, answer.read()
 
 
-def stream(page, path, states):
+def streamed(page, path, states):
     """The JPEG image that the page streams for each state."""
     with contextlib.closing(http.client.HTTPConnection(page.host, page.port, timeout=WAIT_S)) as connection:
         connection.request("GET", path)

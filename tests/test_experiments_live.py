@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from led_simulator import WAIT_S
-from page_client import ask, stream
+from page_client import ask, streamed
 from session_writer import ORIGIN, SIZE, shot
 
 import sts_jax as sts
@@ -186,7 +186,7 @@ def test_the_page_shows_a_state_and_only_to_its_own_name(page):
     assert ask(page, "GET", "/view", Host="evil.example")[0] == 403
     for path in ("/other.mjpg", "/outcomes.jpg", "/predicted_outcomes.jpg"):
         assert ask(page, "GET", path)[0] == 404
-    for jpeg in stream(page, "/predicted_tactile.mjpg", [seen(), seen()]):
+    for jpeg in streamed(page, "/predicted_tactile.mjpg", [seen(), seen()]):
         image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
         assert abs(float(image.mean()) - 92) < 1
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from led_simulator import WAIT_S
-from page_client import ask, stream
+from page_client import ask, streamed
 from player import Player
 from session_writer import ORIGIN, pair
 from test_hardware_collecting import check
@@ -116,7 +116,7 @@ def test_the_page_shows_a_view(page):
 
 
 def test_the_page_streams_each_pair_once(page):
-    for jpeg in stream(page, "/tactile.mjpg", [view() for _ in range(3)]):
+    for jpeg in streamed(page, "/tactile.mjpg", [view() for _ in range(3)]):
         assert jpeg.startswith(b"\xff\xd8")
         assert jpeg.endswith(b"\xff\xd9")
 
