@@ -19,7 +19,7 @@ import contextlib
 import dataclasses
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -111,53 +111,58 @@ def opened(config: Config) -> Iterator[Source]:
             yield Source("a digital twin of the sensor", sensor, Path(folder))
 
 
-def follow(config: Config, source: Source, predictor: sts.Predictor, page: LivePage | None) -> None:
-    """Connect the source, and show, predict from and record its images until it ends or the user quits."""
-    views = Views.load(source.file, divided=config.flat)
+def images(config: Config, source: Source) -> Generator[hardware.Shot, None, None]:
+    """Read and record the images of a connected source, until it ends or the time `--seconds` is over."""
+    sensor, started_s, recorder = source.sensor, time.monotonic(), None
     with contextlib.ExitStack() as stack:
-        live = stack.enter_context(Live(predictor, views, config.condition))
-        stack.enter_context(source.sensor)  # the clock of a replay starts now
-        sensor = source.sensor
-        recorder = None
-        if config.record is not None and isinstance(sensor, hardware.STS):
+        if isinstance(sensor, hardware.STS) and config.record is not None:
             origin = hardware.Origin.of(sensor)
             recorder = hardware.Recorder(config.record, origin, encoding=config.encoding, file=source.file)
             stack.callback(recorder.close)
-        newest, shown, moments = dict[str, hardware.Shot](), dict[str, Image](), list[Image]()
+        options = {} if isinstance(sensor, hardware.Replay) else {"dwell": config.dwell}
+        for shot in sensor.stream(**options):
+            if recorder is not None:
+                recorder.add(shot)
+            yield shot
+            if config.seconds is not None and time.monotonic() > started_s + config.seconds:
+                return
+    say("the replay has ended")
+
+
+def follow(config: Config, source: Source, predictor: sts.Predictor, page: LivePage | None) -> None:
+    """Connect the source, and show and predict from its images until it ends or the user quits."""
+    views = Views.load(source.file, divided=config.flat)
+    newest, shown, moments = dict[str, hardware.Shot](), dict[str, Image](), list[Image]()
+    with (
+        Live(predictor, views, config.condition) as live,
+        source.sensor,  # the clock of a replay starts now
+        contextlib.closing(images(config, source)) as shots,
+    ):
         started_s = printed_s = time.monotonic()
         try:
-            replayed = isinstance(sensor, hardware.Replay)
-            for shot in sensor.stream() if replayed else sensor.stream(0.5, dwell=config.dwell):
+            for shot in shots:
                 newest[shot.stream], shown[shot.stream] = shot, views.shown(shot.image)
-                now_s = time.monotonic()
-                if recorder is not None:
-                    recorder.add(shot)
-                if len(newest) == 2:
-                    live.offer(**newest)
-                    seen = Seen(**shown, time_s=shot.time_s, predicted=live.newest)
-                    if page is not None:
-                        page.show(seen)
-                    if seen.predicted is not None and now_s > printed_s + PRINT_S:
-                        printed_s = now_s
-                        if config.save is not None:
-                            moments.append(panel(seen))
-                        if page is None:
-                            print(", ".join(seen.predicted.lines()), flush=True)
-                if config.seconds is not None and now_s > started_s + config.seconds:
-                    break
-            else:
-                say("the replay has ended")
+                if len(newest) < 2:
+                    continue
+                live.offer(**newest)
+                seen = Seen(**shown, time_s=shot.time_s, predicted=live.newest)
+                if page is not None:
+                    page.show(seen)
+                if seen.predicted is not None and time.monotonic() > printed_s + PRINT_S:
+                    printed_s = time.monotonic()
+                    if config.save is not None:
+                        moments.append(panel(seen))
+                    if page is None:
+                        print(", ".join(seen.predicted.lines()), flush=True)
         except KeyboardInterrupt:
             say("stopped")
-        if config.save is not None and moments:
-            save(config.save, moments)
         duration_s, latency_ms = time.monotonic() - started_s, live.newest.latency_ms if live.newest else 0.0
         say(
             f"{live.made} predictions in {duration_s:.1f} s: {live.made / duration_s:.1f} per second, median latency "
             f"{latency_ms:.0f} ms, {live.offered - live.made} images without a prediction of their own"
         )
-        if recorder is not None:
-            say(f"{sum(recorder.counts.values())} images in {recorder.folder}")
+    if config.save is not None and moments:
+        save(config.save, moments)
 
 
 def save(path: Path, moments: list[Image]) -> None:
