@@ -176,12 +176,11 @@ def test_an_interrupted_run_resumes_and_writes_a_file_that_opens_the_sensor(peer
     with pytest.raises(hardware.LedError, match="EMULATED was not found"):
         hardware.STS.from_file(config.out).connect()
     camera = hardware.OpenCVCamera(hardware.CameraConfig("http://127.0.0.1:9/video"))
-    with hardware.Leds.connect(peer.path) as leds:
-        with pytest.raises(ValueError, match=r"bench is for the camera .*give another --out"):
-            commissioning.check_folder(config, camera, leds)
-        (config.out / "sensor.json").unlink()
-        with pytest.raises(ValueError, match=r"board/camera.json was made with camera = "):
-            commissioning.check_folder(config, camera, leds)
+    with (
+        hardware.Leds.connect(peer.path) as leds,
+        pytest.raises(ValueError, match=r"board/camera.json was made with camera = .*choose another folder"),
+    ):
+        commissioning.claim_folder(config, camera, leds)
 
 
 def test_another_controller_on_the_port_is_refused(tmp_path, peer):

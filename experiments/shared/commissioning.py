@@ -90,7 +90,7 @@ def commission(config: Config) -> None:
         hardware.check_view(lens, simulated.camera)
         say(f"lens: assumed without error, {config.ideal_lens:g} degrees across the diagonal, NOT calibrated")
     with opened(config) as (camera, leds):
-        check_folder(config, camera, leds)
+        claim_folder(config, camera, leds)
         wait("Take everything off the pad, and leave the sensor untouched.", config.every)
         exposures = expose(config, camera, leds)
         with hardware.STS(camera=camera, leds=leds, levels=config.levels, exposures=exposures).connect() as sensor:
@@ -153,19 +153,11 @@ def opened(config: Config) -> Iterator[tuple[hardware.OpenCVCamera, hardware.Led
             yield camera, leds
 
 
-def check_folder(config: Config, camera: hardware.OpenCVCamera, leds: hardware.Leds) -> None:
-    """Refuse a folder with the sensor file of other devices, or with pictures of another camera or printed board."""
-    there = None
-    with contextlib.suppress(OSError, ValueError):  # a missing or damaged file is written anew
-        there = hardware.Device.load(config.out)
-    if there is not None and (there.camera, there.leds) != (camera.source, leds.serial_number):
-        raise ValueError(
-            f"{config.out} is for the camera {there.camera} and the LED controller {there.leds}, but the connected "
-            f"devices are {camera.source} and {leds.serial_number}: give another --out"
-        )
-    if config.ideal_lens is None:
-        content = {"camera": camera.source, "width": config.width, "height": config.height, "ruler": config.ruler}
-        storage.claim(config.out / "board" / "camera.json", content)
+def claim_folder(config: Config, camera: hardware.OpenCVCamera, leds: hardware.Leds) -> None:
+    """Reserve the output folder for one camera and controller, one size of the images and one printed board."""
+    devices = {"camera": camera.source, "leds": leds.serial_number}
+    content = {**devices, "width": config.width, "height": config.height, "ruler": config.ruler}
+    storage.claim(config.out / "board" / "camera.json", content)
 
 
 def expose(config: Config, camera: hardware.OpenCVCamera, leds: hardware.Leds) -> tuple[float, float] | None:
