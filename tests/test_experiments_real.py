@@ -226,7 +226,7 @@ def test_bad_options_are_named(tmp_path, options, message):
 def test_unknown_trajectories_and_folders_are_named(workdir, tmp_path):
     for review, message in (
         (real.Review(workdir, discard=(9,)), "00009 does not exist"),
-        (real.Review(workdir, sheet=workdir / "a.png", numbers=(2,)), r"trajectories with the numbers \[2\]"),
+        (real.Review(workdir, sheet=workdir / "a.png", numbers=(2,)), r"confirmed trajectories \[2\]"),
         (real.Review(tmp_path / "none"), "holds no session"),
     ):
         with pytest.raises(SystemExit, match=message):
