@@ -392,7 +392,7 @@ def test_devices_are_listed(config, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"ideal_lens": 0.0}, "--ideal-lens must be .* got 0"),
+        ({"ideal_lens": 0.0}, "field_of_view must be .* got 0"),
         ({"levels": (0, 0, 0, 0)}, "at least one above 0"),
         ({"pictures": 3}, "pictures must be >= 6, got 3"),
         ({"ruler": 10.0}, "ruler must be .* got 10"),
