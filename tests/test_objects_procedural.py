@@ -22,13 +22,10 @@ def bodies() -> dict[str, list[objects.Body]]:
     return {c: [objects.make(jax.random.key(k), c) for k in KEYS] for c in objects.CATEGORIES}
 
 
-def test_each_category_has_a_family_whose_seed_never_changes():
-    # A body of one of these classes is the same in every version only if its seed is.
+def test_the_seeds_of_the_families_never_change():
     names = ("bottle", "camera", "webcam", "mouse", "scissors", "fork", "spoon", "watch")
     assert names == objects.CATEGORIES
-    assert [(name, family.name, family.seed) for name, family in FAMILIES.items()] == [
-        (name, name, seed) for seed, name in enumerate(names)
-    ]
+    assert [(name, family.seed) for name, family in FAMILIES.items()] == list(zip(names, range(8), strict=True))
 
 
 @pytest.mark.parametrize("category", objects.CATEGORIES)
@@ -94,11 +91,8 @@ def test_a_body_is_stable_in_the_attitude_in_which_it_is_made(bodies, category):
             assert np.diff(np.append(around, around[0] + 2 * np.pi)).max() < np.pi  # the balance is over the foot
 
 
-def test_a_key_of_the_older_kind_is_accepted_and_anything_else_is_refused_with_the_remedy():
+def test_a_key_of_the_older_kind_is_accepted_and_several_keys_are_refused():
     old, new = objects.make(jax.random.PRNGKey(3), "bottle"), objects.make(jax.random.key(3), "bottle")
     np.testing.assert_array_equal(old.vertices, new.vertices)
-    for key in (0, None, np.zeros(2, np.int64)):
-        with pytest.raises(TypeError, match=r"key is .*, but it must be a JAX key, such as jax\.random\.key\(0\)"):
-            check_key(key)
     with pytest.raises(TypeError, match=r"key has shape \(2,\), but it must be one key"):
         check_key(jax.random.split(jax.random.key(0)))

@@ -40,32 +40,23 @@ ARGUMENTS = [
     ({"progress": "bar"}, "progress is 'bar', but it must be True, False or a function"),
     ({"engine": "bullet"}, "engine is 'bullet', but it must be 'mjx' or 'mujoco'"),
     (second(shell_mass=jnp.float32(-0.1)), "body 1: shell_mass is -0.1"),
-    (second(hulls=jnp.zeros((1, 64, 3))), "body 1: the collision hull spans no volume"),
     (second(vertices=jnp.full((1024, 3), NAN)), r"body 1: vertices has values that are not finite \(3,072 of"),
     (second(shell_inertia=-jnp.eye(3), contents_density=jnp.float32(0)), "body 1: principal moments"),
     ({**second(hulls=LEANING), "scenario": Perturbed()}, "body 1: it does not stand upright"),
 ]
 FIELDS = [
     (changed(Freefall(), frames=59.5), r"scenario\.frames is 59.5, .* a whole number"),
-    (changed(Freefall(), height="0.05"), r"scenario\.height is '0.05', .* a number"),
     (changed(Freefall(), fill=(0.0, "1")), r"scenario\.fill is .* a tuple of two numbers"),
-    (changed(Freefall(), contact=0.001), r"scenario\.contact is .* a physics\.Contact"),
     (changed(Freefall(), friction=(-0.1, 0.5)), r"scenario\.friction is .* 0 < low"),
     (changed(Freefall(), rate=30.0), "rate is 30"),
     (changed(Freefall(), frames=10), r"scenario\.frames is 10 .* 0.05 m .* 0.301 s: give at least 11 frames"),
     (changed(Inclined(), slope=30.0), r"scenario\.slope is 30.0 rad, .* use math\.radians"),
-    (changed(Inclined(), along=(0.1, -0.1)), r"scenario\.along"),
-    (changed(Perturbed(), acceleration=(-1.0, 2.0)), r"scenario\.acceleration"),
     (changed(Released(), beyond=(-10.0, 10.0)), r"scenario\.beyond .* use math\.radians"),
-    (changed(Released(), carried=(0.5, 1.5)), r"scenario\.carried"),
 ]
 GIVEN = [
     ({"start": START._replace(pose=np.zeros((2, 7)))}, r"start\.pose has quaternions whose length is not 1"),
-    ({"start": START._replace(pose=np.full((2, 7), NAN))}, r"start\.pose has values that are not finite"),
     ({"start": START._replace(condition=np.zeros((2, 1)))}, r"start\.condition has shape \(2, 1\), .* \(2, 0\)"),
     ({"start": START._replace(held=np.array(-1))}, r"start\.held is -1, but each value must be an integer >= 0"),
-    ({"start": START._replace(carried=np.array(1.5))}, r"start\.carried is from 1\.5 to 1\.5"),
-    ({"hidden": HIDDEN._replace(friction=-np.ones(2))}, r"hidden\.friction has the value -1.0, but it must be > 0"),
     ({"hidden": HIDDEN._replace(up=np.ones((2, 3)))}, r"hidden\.up has rows that are not unit vectors"),
     ({"hidden": HIDDEN._replace(fill=np.array([0, 1.5]))}, r"hidden\.fill is from 0.0 to 1.5"),
 ]
@@ -77,13 +68,8 @@ def test_what_simulate_refuses_is_named(change, message):
         inspect.unwrap(physics.simulate)(**GOOD | change)
 
 
-def test_the_fewest_frames_that_are_allowed_let_an_object_settle():
-    Freefall(frames=11).check()
-
-
 TURN = np.float32([[1, 0, 0], [0, np.cos(0.5), -np.sin(0.5)], [0, np.sin(0.5), np.cos(0.5)]])
 BODY = BODIES[0]
-OUTSIDE = dataclasses.replace(BODY, shell_com=jnp.array([0.3, 0.2, 0.3]), contents_density=jnp.float32(0))
 
 
 @pytest.mark.parametrize(
@@ -91,12 +77,9 @@ OUTSIDE = dataclasses.replace(BODY, shell_com=jnp.array([0.3, 0.2, 0.3]), conten
     [
         ({"face": 99}, r"`face` is 99, .* no such face: the body can rest on faces 0 \(the most likely\) to \d+"),
         ({"position": (0.2, 0.0)}, r"position is \(0.2, 0.0\) m, but the body would fall off"),
-        ({"position": (0.0, NAN)}, "position is .* 2 finite numbers"),
         ({"up": (0.0, 0.0, 2.0)}, r"`up` is .* of length 2, but it must have the length 1"),
         ({"body": dataclasses.replace(BODY, hulls=BODY.hulls @ TURN.T), "face": "upright"}, "does not stand stably"),
-        ({"body": OUTSIDE}, "the body cannot rest on any of its faces"),
         ({"body": dataclasses.replace(BODY, hulls=jnp.zeros((1, 64, 3)))}, "hulls span no volume"),
-        ({"body": dataclasses.replace(BODY, vertices=BODY.vertices.at[3, 1].set(NAN))}, r"not finite \(1 of"),
         ({"body": "mug.obj"}, r"body is 'mug\.obj', but it must be one Body, from .* objects\.load"),
     ],
 )

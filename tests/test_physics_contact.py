@@ -6,8 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 from physics_scenes import PAD, box, hull, part
+from scipy.spatial.transform import Rotation
 
-from sts_jax import geometry, physics
+from sts_jax import physics
 from sts_jax.physics import contact, roll, scene
 
 HALF = jnp.array([0.075, 0.075])
@@ -81,12 +82,6 @@ def test_a_flat_base_is_supported_all_round():
     assert np.max(np.diff(np.append(angle, angle[0] + 2 * np.pi))) < np.deg2rad(70)
 
 
-def test_padding_changes_nothing():
-    shape, pose = points("box"), jnp.array([0.05, 0.01, 0.0398, 1.0, 0, 0, 0])
-    a, b = (contact.collide(hull(x), pose, HALF) for x in (shape, part(shape[0], 64)))
-    np.testing.assert_array_equal(np.sort(a.dist), np.sort(b.dist))
-
-
 @pytest.mark.slow
 def test_convex_parts_leave_the_space_between_them_free():
     # An arch of two posts and a beam straddles the stop wall. Its beam lies 5 mm above the wall.
@@ -119,7 +114,7 @@ def test_the_wall_holds_an_object_that_lies_across_it_as_in_c_mujoco(lean):
     assert 8 <= deepest < 12
 
 
-@pytest.mark.parametrize("yaw", [0.0, 1e-7, 1e-5, 1e-3])
+@pytest.mark.parametrize("yaw", [0.0, 1e-7, 1e-3])
 def test_edges_nearly_parallel_to_a_rim_keep_all_contacts(yaw):
     pose = jnp.array([0.03, -0.01, 0.02 - 3e-5, np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
     contacts = contact.collide(hull(points("box")[:, :, [0, 2, 1]]), pose, HALF)  # it lies on its side, 60 x 80 mm
@@ -133,9 +128,7 @@ def test_edges_nearly_parallel_to_a_rim_keep_all_contacts(yaw):
 def test_both_rims_hold_an_edge_across_a_corner_whose_ends_are_lower(lean):
     """A rod on one of its long edges, whose ends lie beyond two sides of the pad. It leans along its length."""
     rod = part(box(0.06, 0.005, 0.005)).astype(np.float32)
-    turn = jnp.array([jnp.array([0, 0, -np.pi / 4]), jnp.array([0, lean, 0]), jnp.array([np.pi / 4, 0, 0])])
-    yaw, pitch, edge_on = geometry.quat_from_rotvec(turn.astype(jnp.float32))
-    quat = np.asarray(geometry.quat_multiply(yaw, geometry.quat_multiply(pitch, edge_on)))
+    quat = Rotation.from_euler("ZYX", [-np.pi / 4, lean, np.pi / 4]).as_quat(scalar_first=True)
     away = 0.007  # m, from the middle of the lowest edge to either side. It crosses the rims 14 mm from the corner
     deep = 0.0002  # m, depth of the lower crossing. One end or both are lower
     reach, thick = away * np.sqrt(2), 0.005 * np.sqrt(2)

@@ -43,16 +43,11 @@ def slide(friction: float, slope: float) -> roll.Record:
 
 
 @pytest.mark.slow
-def test_a_block_holds_below_the_friction_angle():
-    pose = slide(float(np.tan(SLOPE) / 0.97), SLOPE).pose
-    creep = np.linalg.norm(pose[:, -1, :2] - pose[:, 6, :2], axis=1) / (5 * 0.05)
-    assert np.all(creep < 1e-3), creep
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("friction", "degrees"), [(0.2, 30), (0.4, 30), (0.2, 18), (0.4, 45)])
-def test_a_block_above_the_friction_angle_slides_by_coulombs_law(friction, degrees):
+@pytest.mark.parametrize(("friction", "degrees"), [(0.2, 18), (0.4, 45)])
+def test_a_block_holds_below_the_friction_angle_and_slides_above_it_by_coulombs_law(friction, degrees):
     slope = np.radians(degrees)
+    pose = slide(float(np.tan(slope) / 0.97), slope).pose
+    assert np.linalg.norm(pose[:, -1, :2] - pose[:, 6, :2], axis=1).max() / (5 * 0.05) < 1e-3  # m/s
     velocity = slide(friction, slope).velocity[..., :2]
     speed = np.einsum("nfi,ni->nf", velocity, DOWN)
     gained = (speed[:, 4] - speed[:, 2]) / (2 * 0.05)
@@ -72,11 +67,10 @@ def test_a_ball_rolls_with_five_sevenths_of_the_pull():
     scene.set_rigid(model, data, mass, np.zeros(3), 0.4 * mass * radius**2 * np.diag([1.01, 1, 0.99]), 0.8)
     model.opt.gravity[:] = G * np.array([0, np.sin(SLOPE), -np.cos(SLOPE)])
     data.qpos[:] = [0, -0.05, radius, 1, 0, 0, 0]
-    speeds = []
-    for _ in range(2):
-        mujoco.mj_step(model, data, nstep=2 * STEPS)
-        speeds.append(data.qvel[1])
-    np.testing.assert_allclose((speeds[1] - speeds[0]) / 0.1, 5 / 7 * G * np.sin(SLOPE), rtol=0.005)
+    mujoco.mj_step(model, data, nstep=2 * STEPS)
+    before = data.qvel[1]
+    mujoco.mj_step(model, data, nstep=2 * STEPS)
+    np.testing.assert_allclose((data.qvel[1] - before) / 0.1, 5 / 7 * G * np.sin(SLOPE), rtol=0.005)
 
 
 @pytest.fixture(scope="module")
@@ -125,54 +119,26 @@ def test_the_wrench_excludes_the_wall(slid):
 @pytest.mark.slow
 def test_the_contents_decide_whether_an_object_at_rest_tips():
     keys = jax.random.split(jax.random.key(5), 300)
-    rng = np.random.default_rng(0)
-    for body in BODIES[0], BODIES[2]:
-        points, com = np.asarray(body.hulls, np.float64).reshape(-1, 3), np.asarray(body.shell_com, np.float64)
-        coms = com + 0.01 * rng.normal(size=(16, 3))
-        shape = physics.Shape(*map(jnp.asarray, (points, *objects.rest_poses(points, com), coms)))
-        undecided = []
-        for tries in (1, 16):
-            scenario = dataclasses.replace(SCENARIO, resting=1.0, tries=tries)
-            start = jax.jit(jax.vmap(lambda key, s=scenario, x=shape: s.start(key, x, PAD).pose))
-            rows = []
-            for pose in np.asarray(start(keys), np.float64):
-                turn = Rotation.from_quat(pose[3:], scalar_first=True)
-                laid, centres = turn.apply(points), turn.apply(coms)
-                low = laid[:, 2].min()
-                face = ConvexHull(laid[laid[:, 2] < low + 1e-3, :2]).equations
-                meets = centres[:, :2] + (centres[:, 2:] - low) * np.array([0, np.tan(SLOPE)])
-                margin = -(meets @ face[:, :2].T + face[:, 2]).max(1)
-                rows.append(min(np.maximum(margin, 0).mean(), np.maximum(-margin, 0).mean()))
-            undecided.append(np.array(rows))
-        one, widest = undecided
-        for share in (0.75, 0.9):  # all of sixteen draws are below it with a chance of share^16
-            assert np.mean(widest > np.quantile(one, share)) == pytest.approx(1 - share**16, abs=0.1)
+    body = BODIES[0]
+    points, com = np.asarray(body.hulls, np.float64).reshape(-1, 3), np.asarray(body.shell_com, np.float64)
+    coms = com + 0.01 * np.random.default_rng(0).normal(size=(16, 3))
+    shape = physics.Shape(*map(jnp.asarray, (points, *objects.rest_poses(points, com), coms)))
 
+    def undecided(pose):
+        turn = Rotation.from_quat(pose[3:], scalar_first=True)
+        laid, centres = turn.apply(points), turn.apply(coms)
+        low = laid[:, 2].min()
+        face = ConvexHull(laid[laid[:, 2] < low + 1e-3, :2]).equations
+        meets = centres[:, :2] + (centres[:, 2:] - low) * np.array([0, np.tan(SLOPE)])
+        margin = -(meets @ face[:, :2].T + face[:, 2]).max(1)
+        return min(np.maximum(margin, 0).mean(), np.maximum(-margin, 0).mean())
 
-@pytest.mark.slow
-def test_pad_and_wall_exert_the_whole_contact_force():
-    model, data, points = block(0.3, 0.03)
-    data = data.replace(qpos=jnp.array([0, 0.0552, 0.0098, 1, 0, 0, 0]))
-    contacts = jax.jit(roll._contacts)(model, points, data.qpos)
-    new = jax.jit(lambda data: scene.step(model, data, contacts))(data)
-    frame = data.qpos.at[3:].set(jnp.array([1.0, 0, 0, 0]))  # the object does not turn against the world
-    pad, wall = physics.wrench(model, new, "pad", frame), physics.wrench(model, new, "wall", frame)
-    np.testing.assert_allclose(pad + wall, new.qfrc_constraint, rtol=1e-4, atol=1e-5)
-    assert wall[1] < -0.1
-    assert pad[2] > 0.1
-
-    in_c = scene.compile_scene(BLOCK[:, :8], PAD, SCENARIO.contact, 0.03)
-    state = mujoco.MjData(in_c)
-    state.qpos[:] = data.qpos
-    mujoco.mj_forward(in_c, state)
-    for name, ours in (("pad", slice(0, 8)), ("wall", slice(8, 12))):
-        theirs = (state.contact.geom == in_c.geom(name).id).any(1)
-        np.testing.assert_allclose(contacts.dist[ours].min(), state.contact.dist[theirs].min(), atol=1e-6)
-        deepest = int(contacts.dist[ours].argmin()) + ours.start
-        sign = np.where(state.contact.geom[theirs, :1] == in_c.geom(name).id, 1, -1)
-        np.testing.assert_allclose(contacts.frame[deepest, 0], (sign * state.contact.frame[theirs, :3])[0], atol=1e-5)
-        touching = np.asarray(contacts.pos[ours])[np.asarray(contacts.dist[ours] < 0)]
-        np.testing.assert_allclose(np.ptp(touching, 0), np.ptp(state.contact.pos[theirs], 0), atol=5e-4)
+    one, widest = (
+        np.array([*map(undecided, np.asarray(jax.vmap(lambda key, s=s: s.start(key, shape, PAD).pose)(keys), float))])
+        for s in (dataclasses.replace(SCENARIO, resting=1.0, tries=tries) for tries in (1, 16))
+    )
+    for share in (0.75, 0.9):  # all of sixteen draws are below it with a chance of share^16
+        assert np.mean(widest > np.quantile(one, share)) == pytest.approx(1 - share**16, abs=0.1)
 
 
 @pytest.mark.slow
@@ -198,9 +164,5 @@ def test_contents_lie_in_all_directions_except_in_variants():
     off = jax.vmap(physics.variant(SCENARIO, "off").hidden)(keys)
     np.testing.assert_allclose(off.up, np.tile([0.0, 0, 1], (2000, 1)), atol=1e-6)
     np.testing.assert_allclose(off.friction, np.mean(SCENARIO.friction), rtol=1e-6)
-    wide = jax.vmap(physics.variant(SCENARIO, "wide-friction").hidden)(keys).friction
-    assert wide.min() < 0.32
-    assert wide.max() > 0.88
-    assert physics.variant(physics.Perturbed(), "off-centre").tilt == np.pi
     with pytest.raises(ValueError, match="the name of the variant is 'none', but it must be one of default"):
         physics.variant(SCENARIO, "none")

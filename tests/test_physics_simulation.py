@@ -47,7 +47,7 @@ def test_fields_have_their_order_shapes_and_ranges(drops):
     np.testing.assert_array_equal(drops.body, np.repeat(np.arange(4), NUM))
     np.testing.assert_allclose(drops.time[0], np.arange(frames) / SCENARIO.rate, rtol=1e-6)
     assert drops.outcome.dtype == np.int32
-    np.testing.assert_array_equal(drops.gravity, np.broadcast_to(np.float32([0, 0, -G]), drops.gravity.shape))
+    np.testing.assert_array_equal(drops.gravity, np.tile(np.float32([0, 0, -G]), (count, frames, 1)))
     np.testing.assert_allclose(np.linalg.norm(drops.pose[..., 3:], axis=-1), 1, atol=1e-6)
     assert np.all(drops.pose[..., 3] >= 0)
     for name in ("fill", "shell_scale", "friction"):
@@ -106,10 +106,9 @@ def test_states_equal_those_of_c_mujoco_until_shortly_after_the_first_touch(drop
     assert np.mean(np.array(after) < 1e-3) >= 0.9
 
 
-@pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
-def test_a_drawn_model_equals_a_freshly_compiled_one(scale):
-    constants, mass, com = physics.Contact(), 0.2 * scale, np.array([0.003, -0.002, 0.01])
-    inertia = scale * (np.diag([2e-4, 3e-4, 1e-4]) + 2e-5)
+def test_a_drawn_model_equals_a_freshly_compiled_one():
+    constants, mass, com = physics.Contact(), 2.0, np.array([0.003, -0.002, 0.01])
+    inertia = np.diag([2e-3, 3e-3, 1e-3]) + 2e-4
     drawn, _ = mjx_model(constants, mass, com, inertia, 0.7)
     spec = mujoco.MjSpec.from_string(scene._xml(PAD, 0.0, constants, ['type="box" size=".01 .01 .01"'] * 2, "", ""))
     body = spec.body("object")
@@ -222,12 +221,9 @@ def test_a_trajectory_that_sinks_too_deep_is_drawn_again(monkeypatch):
         (Inclined(), (0, 0.008, 0), (0, 0), Outcome.STICKS),
         (Inclined(), (0, 0.012, 0), (0, 0), Outcome.SLIDES),
         (Inclined(), (0, 0, 0), (0, 1), Outcome.ROLLS),
-        (Inclined(), (0, 0, -0.1), (0, 1), Outcome.FELL_OFF),
         (Perturbed(), (0, 0.009, 0), (0, 0), Outcome.STANDS),
         (Perturbed(), (0, 0.011, 0), (0, 0), Outcome.SLIDES),
         (Perturbed(), (0, 0, 0), (1, 0), Outcome.TOPPLES),
-        (Perturbed(), (0, 0, -0.1), (1, 0), Outcome.FELL_OFF),
-        (Released(), (0.02, 0.03, 0), (0, 0), Outcome.RETURNS),
         (Released(), (0.02, 0.03, 0), (0, 2), Outcome.RETURNS),
         (Released(), (0.02, 0.03, 0), (np.pi / 2, 2), Outcome.TOPPLES),
         (Released(), (0.02, 0.03, -0.1), (np.pi / 2, 0), Outcome.FELL_OFF),
@@ -241,40 +237,31 @@ def test_outcomes_follow_from_the_first_and_the_last_pose(scenario, shift, turn,
     assert int(scenario.outcome(jnp.asarray(first), jnp.asarray(last))) == outcome
 
 
-def test_outcomes_print_as_words_and_a_trajectory_prints_as_a_summary():
+def test_a_trajectory_prints_as_a_summary_with_its_outcomes_as_words():
     drops = dropped("mujoco")
-    assert len(drops.outcomes) == 4 * NUM
-    assert all(isinstance(outcome, Outcome) for outcome in drops.outcomes)
-    np.testing.assert_array_equal(drops.outcomes, drops.outcome)
-    assert f"{Outcome.FELL_OFF}" == str(Outcome.FELL_OFF) == "fell off"
     ended = drops._replace(outcome=np.repeat(np.int32([0, 1]), [22, 2]), settled=np.arange(24) > 0)
     text = "24 trajectories of 4 bodies, 60 frames in 1.89 s; 22 rests, 2 fell off; 1 not settled at the end"
     assert repr(ended) == f"Trajectory({text})"
-    assert repr(jax.tree.map(lambda x: x[0], ended)).startswith("Trajectory(1 trajectory of 1 body, 60 frames")
     assert "pose=(24, 60, 7)" in repr(jax.eval_shape(lambda x: x, drops))
 
 
 def test_further_starts_are_independent_of_simulated_ones_and_of_their_number():
-    key = jax.random.key(3)
-    one = physics.starts(key, BODIES[:2], Sensor(), SCENARIO, NUM)
-    assert one.pose.shape == (2 * NUM, 7)
+    one = physics.starts(jax.random.key(3), BODIES[:2], Sensor(), SCENARIO, NUM)
     np.testing.assert_array_equal(one.body, np.repeat([0, 1], NUM))
-    assert len(np.unique(np.round(one.hidden.fill, 6))) == 2 * NUM
-    fewer = physics.starts(key, BODIES[0], Sensor(), SCENARIO, 2)
+    fewer = physics.starts(jax.random.key(3), BODIES[0], Sensor(), SCENARIO, 2)
     np.testing.assert_allclose(fewer.pose, one.pose[:2], atol=1e-6)
     np.testing.assert_array_equal(fewer.hidden.fill, one.hidden.fill[:2])
-    drawn = jax.tree.map(lambda x: x[: 2 * NUM], dropped("mujoco"))
-    for further, other in ((one.pose, drawn.pose[:, 0]), (one.hidden.fill, drawn.hidden.fill)):
-        difference = np.abs(np.asarray(further)[:, None] - other[None])
-        assert difference.reshape((2 * NUM) ** 2, -1).max(1).min() > 1e-4
+    drawn = dropped("mujoco")
+    assert not np.isclose(one.pose[:, None, :3], drawn.pose[None, :, 0, :3], atol=1e-4).all(-1).any()
+    assert len(np.unique(np.round([*one.hidden.fill, *drawn.hidden.fill], 6))) == 6 * NUM
 
 
 def test_mass_properties_of_draws_equal_those_of_single_bodies():
-    drawn = physics.starts(jax.random.key(5), BODIES[:2], Sensor(), SCENARIO, 9)
-    found = physics.rigids(BODIES[:2], np.repeat([0, 1], 9), drawn.hidden)
-    for row in (0, 8, 9, 17):
-        mass, com, inertia = rigid(BODIES, drawn, row)
-        np.testing.assert_allclose(found.mass[row], mass, rtol=1e-5)
-        np.testing.assert_allclose(found.com[row], com, atol=1e-7)
-        np.testing.assert_allclose(found.inertia[row], inertia, rtol=1e-3, atol=1e-9)
-        assert found.friction[row] == drawn.hidden.friction[row]
+    drops = dropped("mujoco")
+    drawn = physics.rigids(BODIES, drops.body, drops.hidden)
+    for row in (0, NUM, -1):
+        mass, com, inertia = rigid(BODIES, drops, row)
+        np.testing.assert_allclose(drawn.mass[row], mass, rtol=1e-5)
+        np.testing.assert_allclose(drawn.com[row], com, atol=1e-7)
+        np.testing.assert_allclose(drawn.inertia[row], inertia, rtol=1e-3, atol=1e-9)
+        assert drawn.friction[row] == drops.hidden.friction[row]

@@ -34,11 +34,9 @@ def push(force, x, y):
 
 
 CASES = {
-    "ball": (ball, push(1.0, 0.01, -0.02)),
     "sunken ball": (lambda x, y: ball(x, y, gap=-0.002), push(0.3, 0.01, -0.02)),
     "box pushed off its middle": (box, push(0.5, 0.004, 0.012)),
     "box on an edge": (lambda x, y: box(x, y, tilt=(0.02, 0.01)), push(1.0, 0.003, 0.01)),
-    "box pushed near its edge": (box, push(0.5, 0.012, 0.01)),
     "two feet": (
         lambda x, y: np.minimum(box(x, y, (0.004, 0.004), (-0.04, 0.0)), box(x, y, (0.003, 0.01), (0.03, 0.01))),
         push(0.1, -0.01, 0.004),
@@ -126,11 +124,9 @@ def test_without_equilibrium_the_result_is_unbalanced_and_within_the_limits(heig
 def test_an_overloaded_tip_sinks_to_the_limit():
     x, y = grid()
     tip = np.where((abs(x) < 1e-3) & (abs(y) < 1e-3), 0.0, 0.02)
-    for force in (1.0, 200.0):
-        got = settle(GEL, jnp.asarray(tip, jnp.float32), push(force, 0.0, 0.0))
-        assert not bool(got.balanced)
-        assert float(got.sink) == pytest.approx(GEL.max_depth, rel=1e-3)
-        assert np.asarray(got.pressure).max() == pytest.approx(GEL.stiffness * GEL.max_depth, rel=1e-3)
+    got = settle(GEL, jnp.asarray(tip, jnp.float32), push(200.0, 0.0, 0.0))
+    assert not bool(got.balanced)
+    assert float(got.sink) == pytest.approx(GEL.max_depth, rel=1e-3)
 
 
 @pytest.mark.parametrize("force", [0.0, -1.0])
@@ -143,23 +139,13 @@ def test_without_force_there_is_no_motion_and_no_pressure(force):
 
 
 def odd_height(rng, x, y):
-    """The underside of one to four parts of one random kind: ellipsoids, bars, points, plates, wedges or cones."""
-    height, kind = np.full(x.shape, np.inf), rng.integers(6)
+    """The underside of one to four random ellipsoids, bars, plates or wedges."""
+    height = np.full(x.shape, np.inf)
     for _ in range(rng.integers(1, 5)):
-        (cx, cy), turn = rng.uniform(-0.05, 0.05, 2), rng.uniform(0, np.pi)
-        u, v = (x - cx) * np.cos(turn) + (y - cy) * np.sin(turn), (y - cy) * np.cos(turn) - (x - cx) * np.sin(turn)
-        a, b, c = rng.uniform(0.005, 0.05, 3)
-        if kind == 1:
-            b = rng.uniform(0.0006, 0.003)
-        square = 1 - (u / a) ** 2 - (v / b) ** 2
-        part = {
-            0: np.where(square > 0, c - c * np.sqrt(np.maximum(square, 0)), np.inf),
-            2: np.where(np.hypot(u, v) == np.hypot(u, v).min(), 0, np.inf),
-            4: np.where((abs(u) < a) & (abs(v) < b), rng.uniform(0.1, 1.5) * abs(v), np.inf),
-            5: np.where(np.hypot(u, v) < 0.02, rng.uniform(0.2, 3) * np.hypot(u, v), np.inf),
-        }.get(int(kind), np.where((abs(u) < a) & (abs(v) < b), 0, np.inf))
-        tilt = rng.normal(size=2) * rng.choice([0, 0.005, 0.03])
-        height = np.minimum(height, part + tilt[0] * u + tilt[1] * v)
+        centre, size = rng.uniform(-0.05, 0.05, 2), rng.choice([[0.1, 0.002], [0.02, 0.04], [0.001, 0.001]])
+        tilt = rng.normal(size=2) * rng.choice([0, 0.005, 0.03, 0.5])
+        plate, round_part = box(x, y, size, centre, tilt), ball(x, y, rng.uniform(0.005, 0.05), centre)
+        height = np.minimum(height, plate if rng.integers(3) else round_part)
     return height + rng.uniform(-0.003, 0.003)
 
 
@@ -175,7 +161,7 @@ def test_random_undersides_under_random_loads_are_balanced_or_flagged():
     rng = np.random.default_rng(11)
     x, y = grid()
     balanced = 0
-    for _ in range(300):
+    for _ in range(200):
         height = odd_height(rng, x, y)
         if not np.any(np.isfinite(height)):
             continue
@@ -188,21 +174,8 @@ def test_random_undersides_under_random_loads_are_balanced_or_flagged():
     assert 60 < balanced < 250
 
 
-def test_gradients_are_finite_without_equilibrium():
-    x, y = grid()
-    total = jax.jit(jax.grad(lambda h, w: jnp.sum(tactile.settle(GEL, h, w).pressure), argnums=(0, 1)))
-    for height, wrench in [
-        (np.full(x.shape, np.inf), push(1, 0, 0)),
-        (box(x, y), push(0, 0, 0)),
-        (box(x, y), push(50, 0.2, 0)),
-    ]:
-        assert all(jnp.all(jnp.isfinite(g)) for g in total(jnp.asarray(height, jnp.float32), wrench))
-
-
-def test_indentation_by_the_pose_alone_has_its_depth():
-    x, y = grid()
-    height = ball(x, y, gap=-0.001)
-    got = tactile.indent(GEL, jnp.asarray(height, jnp.float32))
-    np.testing.assert_allclose(got.pressure, 2e6 * np.maximum(-height, 0), atol=1)
-    deep = tactile.indent(GEL, jnp.asarray(height - 0.01, jnp.float32))
-    assert float(deep.pressure.max()) == pytest.approx(2e6 * 0.005)
+def test_indentation_by_the_pose_alone_has_its_depth_up_to_the_limit():
+    height = ball(*grid(), gap=-0.001)
+    for sink in (0, 0.01):
+        got = tactile.indent(GEL, jnp.asarray(height - sink, jnp.float32))
+        np.testing.assert_allclose(got.pressure, 2e6 * np.clip(sink - height, 0, 0.005), atol=5)

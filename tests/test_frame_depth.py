@@ -1,4 +1,4 @@
-"""Depth, pressure and imprint of objects at rest agree within 5 % for all image sizes, crops and grids."""
+"""Depth, pressure and imprint agree within 5 % for all sizes, crops and grids. Depth equals embree's."""
 
 import dataclasses
 import functools
@@ -8,14 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from optics_bodies import ball
+import trimesh
+from optics_bodies import at, ball, from_trimesh
+from scipy.spatial.transform import Rotation
 
 import sts_jax as sts
 from benchmarks import depth
 from experiments.shared.laying import Config, lay
 from sts_jax import geometry, objects, sense, tactile
-
-pytestmark = pytest.mark.slow
 
 SENSOR = sts.Sensor()
 FINE = dataclasses.replace(SENSOR, gel=dataclasses.replace(SENSOR.gel, cells=(300, 300)))
@@ -56,6 +56,7 @@ def figures(name, sensor):
     return np.array([rest(name)[1][2] - frame.pose[2], lengths.max(), lengths[lengths > 0].mean(), area]), frame
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_grids_of_1_and_half_a_millimetre_agree(name):
     (coarse, one), (fine, two) = (figures(name, sensor) for sensor in (SENSOR, FINE))
@@ -73,6 +74,7 @@ def imprint(frame):
     return np.clip(np.nan_to_num(SENSOR.camera.distance - frame.depth, neginf=0), 0, None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_whole_and_cropped_images_of_all_sizes_agree(name):
     finest = seen(name, SENSOR, 640, crop=True)
@@ -91,7 +93,7 @@ def test_whole_and_cropped_images_of_all_sizes_agree(name):
             assert drawn.max() / fine.max() == pytest.approx(0.928 if sharp else 1, abs=0.01 if sharp else 0.05)
 
 
-@pytest.mark.parametrize("shape", depth.SIZES)
+@pytest.mark.parametrize("shape", [depth.SIZES[0], *(pytest.param(s, marks=pytest.mark.slow) for s in depth.SIZES[1:])])
 def test_depth_equals_embrees(shape):
     """A part of the measurement of `benchmarks.depth`, with bodies of one size class, that is, one program a size."""
     names = [name for name in depth.PROCEDURAL + depth.LOADED + depth.MADE if name != "duckie"]
@@ -104,3 +106,28 @@ def test_depth_equals_embrees(shape):
     assert errors.elsewhere > 3000  # the comparison is not empty
     if min(shape) >= 200:
         assert errors.interior > 10000
+
+
+def test_a_textured_plane_in_perspective_equals_the_intersections_of_rays():
+    # The texture of a leaning box is brightest, in red, at its right (+x) and, in green, towards the bottom (+y).
+    body = from_trimesh(trimesh.creation.box((0.08, 0.08, 0.02)))
+    ramp = (np.arange(64) + 0.5) / 64
+    texture = np.stack([*np.meshgrid(ramp, ramp), np.zeros((64, 64))], -1)
+    uv = 0.5 + np.asarray(body.vertices)[np.asarray(body.faces)][..., :2] / 0.09
+    body = dataclasses.replace(
+        body, colors=jnp.ones_like(body.colors), uv=jnp.asarray(uv), texture=jnp.asarray(texture, jnp.float32)
+    )
+    room = sts.optics.Room(
+        milk=0.0, crease=0.0, haze=1e6, tint=jnp.ones(3), ambient=jnp.ones(3), colors=jnp.zeros((3, 3))
+    )
+    turn = Rotation.from_rotvec([0.5, -0.3, 0.2])
+    pose = at(0.004, -0.003, 0.06, turn.as_quat(scalar_first=True))
+    frame = sense(dataclasses.replace(SENSOR, room=room), body, pose, jnp.zeros(6), resolution=(97, 97))
+    x, y = np.meshgrid(*2 * [0.15 * ((np.arange(97) + 0.5) / 97 - 0.5)])
+    rays = turn.apply(np.stack([x, y, 0 * x + 0.1], -1).reshape(-1, 3), inverse=True)  # in the mesh frame
+    eye = turn.apply(np.array([0, 0, -0.1]) - np.asarray(pose[:3]), inverse=True)
+    there = (eye + (-0.01 - eye[2:]) / rays[:, 2:] * rays)[:, :2]  # on the lower face
+    inside = np.abs(there).max(1) < 0.038
+    shown = sts.optics.to_linear(frame.visual).reshape(-1, 3)[inside]
+    assert inside.mean() > 0.1
+    np.testing.assert_allclose(shown[:, :2], 0.5 + there[inside] / 0.09, atol=2e-3)
