@@ -9,7 +9,8 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from sts_jax import Frame
-from sts_jax.objects.body import FACE_CLASSES, Body
+from sts_jax.objects.assembly import assemble
+from sts_jax.objects.body import Body, pad
 
 
 def at(x, y, z, turn=(1.0, 0, 0, 0)):
@@ -54,32 +55,12 @@ def ball(radius=0.03):
 
 
 def from_trimesh(mesh: trimesh.Trimesh, *, color=(0.6, 0.4, 0.3), colors=None) -> Body:
-    """A body with flat normals, in the smallest size class that fits. `colors` has a colour for each face."""
+    """A body in the frame of its mesh. `colors` has a colour for each face."""
     number = len(mesh.faces)
-    padded = next(size for size in FACE_CLASSES if size >= number)
-    normals = np.repeat(mesh.face_normals[:, None], 3, axis=1)
-    colors = np.broadcast_to(np.asarray(color if colors is None else colors, float), (number, 3))
-    hull = mesh.convex_hull.vertices[:64]
-
-    def pad(values, size, filler=0):
-        return np.concatenate([values, np.zeros((size - len(values), *values.shape[1:]), values.dtype) + filler])
-
-    return Body(
-        vertices=jnp.asarray(pad(mesh.vertices, padded, mesh.vertices[-1]), jnp.float32),
-        faces=jnp.asarray(pad(np.asarray(mesh.faces), padded), jnp.int32),
-        normals=jnp.asarray(pad(normals, padded), jnp.float32),
-        colors=jnp.asarray(pad(np.repeat(colors[:, None], 3, axis=1), padded), jnp.float32),
-        uv=jnp.zeros((padded, 3, 2)),
-        texture=jnp.ones((1, 1, 3)),
-        two_sided=jnp.bool_(False),
-        hulls=jnp.asarray(pad(hull, 64, hull[-1]), jnp.float32)[None],
-        shell_mass=jnp.float32(0.1),
-        shell_com=jnp.zeros(3),
-        shell_inertia=jnp.eye(3) * 1e-4,
-        interior=jnp.zeros((padded, 3, 3)),
-        contents_density=jnp.float32(0),
-        category=jnp.int32(-1),
-    )
+    colors = np.broadcast_to(np.asarray(color if colors is None else colors, float)[..., None, :], (number, 3, 3))
+    body = assemble(mesh.vertices, mesh.faces, colors, density=np.ones(number), interior=None, mass=0.1)
+    vertices = pad(mesh.vertices, len(body.vertices), mesh.vertices[-1])  # not about the centroid
+    return dataclasses.replace(body, vertices=jnp.asarray(vertices, jnp.float32))
 
 
 def rays_hidden(mesh, places, num=3000):

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.ndimage import map_coordinates
 
 from sts_jax import tactile
 
@@ -142,16 +143,6 @@ def test_zero_coupling_changes_nothing():
         assert float(by_length) == 0
 
 
-def bilinear(depth, row, column):
-    """Value of an image with zeros around it. Row and column in pixels, whole numbers at pixel centres."""
-    total = 0.0
-    for i in (int(np.floor(row)), int(np.floor(row)) + 1):
-        for j in (int(np.floor(column)), int(np.floor(column)) + 1):
-            if 0 <= i < depth.shape[0] and 0 <= j < depth.shape[1]:
-                total += depth[i, j] * (1 - abs(row - i)) * (1 - abs(column - j))
-    return total
-
-
 def arriving(skin, lights, depth, i, j):
     """Share of each light at one pixel, in float64."""
     pitch = WINDOW[2:] / [depth.shape[1], depth.shape[0]]
@@ -164,8 +155,9 @@ def arriving(skin, lights, depth, i, j):
         for k in range(1, skin.shadow_steps + 1):
             t = skin.shadow_reach * (k / skin.shadow_steps) ** 2
             if away > 0 and (t < away or not near):
-                there = bilinear(depth, i + t * towards[1] / away / pitch[1], j + t * towards[0] / away / pitch[0])
-                rise.append((there - depth[i, j]) / t)
+                place = [[i + t * towards[1] / away / pitch[1]], [j + t * towards[0] / away / pitch[0]]]
+                there = map_coordinates(depth, place, order=1, mode="grid-constant")  # bilinear, 0 outside
+                rise.append((there[0] - depth[i, j]) / t)
         elevation = np.arctan2(-towards[2], away)
         yield np.clip(1 - (np.arctan(max(rise)) - elevation) / skin.penumbra, 0, 1)
 
