@@ -108,6 +108,7 @@ def test_depth_equals_embrees(shape):
         assert errors.interior > 10000
 
 
+@pytest.mark.slow
 def test_a_textured_plane_in_perspective_equals_the_intersections_of_rays():
     # The texture of a leaning box is brightest, in red, at its right (+x) and, in green, towards the bottom (+y).
     body = from_trimesh(trimesh.creation.box((0.08, 0.08, 0.02)))
@@ -129,5 +130,5 @@ def test_a_textured_plane_in_perspective_equals_the_intersections_of_rays():
     there = (eye + (-0.01 - eye[2:]) / rays[:, 2:] * rays)[:, :2]  # on the lower face
     inside = np.abs(there).max(1) < 0.038
     shown = sts.optics.to_linear(frame.visual).reshape(-1, 3)[inside]
-    assert inside.mean() > 0.1
+    assert inside.mean() > 0.08
     np.testing.assert_allclose(shown[:, :2], 0.5 + there[inside] / 0.09, atol=2e-3)
