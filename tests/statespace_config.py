@@ -1,4 +1,4 @@
-"""The smallest state-space models, which compile in seconds, random inputs for them, and a kill of a training."""
+"""The smallest models, which compile in seconds, random inputs for them, and a kill of a training."""
 
 import dataclasses
 
@@ -31,6 +31,16 @@ TINY = statespace.Config(
 )
 
 STATE = dataclasses.replace(TINY, inputs=statespace.INPUTS, outcomes=3, condition=3, input_size=32)
+
+
+SMALL = mvae.Config((mvae.Modality("a", "vector", (3,)), mvae.Modality("b", "vector", (2,))), latent=4, hidden=8)
+
+
+def arrays(samples=20, seed=0):
+    """A training set for `SMALL`."""
+    rng = np.random.default_rng(seed)
+    data = {"a": rng.random((samples, 3), np.float32), "b": rng.random((samples, 2), np.float32)}
+    return training.Arrays(data, data, {"b": rng.random(samples) < 0.5})
 
 
 def random_codes(rng, number):

@@ -45,14 +45,11 @@ class Echo:
 
 
 def test_subsets_are_described_in_words():
-    found = evaluation.subsets(("visual", "tactile", "pose"), state=True)
-    assert list(found) == [
-        *("from visual", "from tactile", "from pose"),
-        *("from visual and tactile", "from visual and pose", "from tactile and pose"),
-        *("from all inputs", "from visual and the true state"),
-    ]
-    assert found["from tactile and pose"] == ("tactile", "pose")
-    assert found["from visual and the true state"] == ("visual", "state")
+    subsets = evaluation.subsets(("visual", "tactile", "pose"), state=True)
+    assert len(subsets) == 2**3
+    assert subsets["from tactile and pose"] == ("tactile", "pose")
+    assert subsets["from all inputs"] == ("visual", "tactile", "pose")
+    assert subsets["from visual and the true state"] == ("visual", "state")
     assert evaluation.subsets(("visual",)) == {"from visual": ("visual",)}
     assert list(evaluation.subsets(()).values()) == [()]
 

@@ -1,6 +1,5 @@
 """Another loss, optimiser, logger and modality, from outside the library, in a training and in a whole experiment."""
 
-import json
 import struct
 
 import jax
@@ -10,19 +9,12 @@ import optax
 import pytest
 from extending_page import blocks
 from flax import nnx
-from statespace_config import Killed, kill_at, same
+from statespace_config import SMALL, Killed, arrays, kill_at, same
 from tensorboardX.proto import event_pb2
 
-from sts_jax import mvae, training
+from sts_jax import training
 
-MODEL = mvae.Config((mvae.Modality("pose", "vector", (3,)), mvae.Modality("sound", "vector", (2,))), latent=4, hidden=8)
 CONFIG = training.TrainConfig(steps=6, batch_size=8, log_every=2, checkpoint_every=4, beta_warmup=0.5)
-
-
-def arrays(samples=20):
-    rng = np.random.default_rng(0)
-    data = {"pose": rng.random((samples, 3), np.float32), "sound": rng.random((samples, 2), np.float32)}
-    return training.Arrays(data, data)
 
 
 def half_square(graphdef, params, stats, key, batch, beta):
@@ -43,20 +35,16 @@ def with_penalty(model, weight):
     return loss
 
 
-def records(folder):
-    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
-
-
 def test_gradient_descent_on_half_the_square_shrinks_the_parameters_geometrically(tmp_path):
-    learner = training.learner(MODEL)
+    learner = training.learner(SMALL)
     _, first = training.initial(CONFIG, learner, 6)
-    model = training.train(CONFIG, MODEL, arrays(), workdir=tmp_path, loss=half_square, optimiser=optax.sgd(0.1))
+    model = training.train(CONFIG, SMALL, arrays(), workdir=tmp_path, loss=half_square, optimiser=optax.sgd(0.1))
     last = nnx.split_state(model.state, nnx.Param, nnx.BatchStat)[0]
     for before, after in zip(jax.tree.leaves(first.params), jax.tree.leaves(last), strict=True):
         np.testing.assert_allclose(after, 0.9**6 * before, rtol=1e-5)
     size = sum(float(jnp.sum(x**2)) for x in jax.tree.leaves(first.params))
     losses = [0.5 * size * 0.81**step for step in range(6)]
-    for record, step in zip(records(tmp_path), (2, 4, 6), strict=True):
+    for record, step in zip(training.records(tmp_path), (2, 4, 6), strict=True):
         assert record["step"] == step
         np.testing.assert_allclose(record["loss"], np.mean(losses[step - 2 : step]), rtol=1e-5)
         np.testing.assert_allclose(record["beta"], np.mean([min(s / 3, 1) for s in (step - 2, step - 1)]), rtol=1e-6)
@@ -64,7 +52,7 @@ def test_gradient_descent_on_half_the_square_shrinks_the_parameters_geometricall
 
 def test_a_folder_is_not_resumed_with_another_loss_optimiser_or_note(tmp_path):
     def run(**more):
-        return training.train(CONFIG, MODEL, arrays(), workdir=tmp_path, **more)
+        return training.train(CONFIG, SMALL, arrays(), workdir=tmp_path, **more)
 
     def no_loss(graphdef, params, stats, key, batch, beta):
         return optax.tree.norm(params), (stats, {"size": optax.tree.norm(params)})
@@ -94,10 +82,10 @@ def test_a_killed_run_with_its_own_parts_has_the_same_bits_and_each_call_logs_ev
         received = []
         model = training.train(
             CONFIG,
-            MODEL,
+            SMALL,
             arrays(),
             workdir=tmp_path / folder,
-            loss=with_penalty(MODEL, 1e-3),
+            loss=with_penalty(SMALL, 1e-3),
             optimiser=optax.chain(optax.clip_by_global_norm(1.0), optax.adamw(1e-2)),
             log=lambda *record: received.append(record),
             **more,
@@ -106,7 +94,7 @@ def test_a_killed_run_with_its_own_parts_has_the_same_bits_and_each_call_logs_ev
 
     whole, logged = run("whole")
     assert [step for step, _ in logged] == [2, 4, 6]
-    assert [{"step": step, **values} for step, values in logged] == records(tmp_path / "whole")
+    assert [{"step": step, **values} for step, values in logged] == training.records(tmp_path / "whole")
     with pytest.raises(Killed):
         run("killed", progress=kill_at(3))
     for _ in range(2):  # the second run is already finished
@@ -133,11 +121,11 @@ def test_the_code_of_the_page_trains_with_a_penalty_and_another_optimiser_and_wr
     tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
-    names = {"model": MODEL, "arrays": arrays(), "config": CONFIG}
+    names = {"model": SMALL, "arrays": arrays(), "config": CONFIG}
     exec("\n".join(blocks("Another loss, another optimiser, another logger")), names)
-    assert [record["step"] for record in records(tmp_path / "model")] == [2, 4, 6]
-    assert all(record["penalty"] > 0 for record in records(tmp_path / "model"))
-    logged = records(tmp_path / "logged")
+    assert [record["step"] for record in training.records(tmp_path / "model")] == [2, 4, 6]
+    assert all(record["penalty"] > 0 for record in training.records(tmp_path / "model"))
+    logged = training.records(tmp_path / "logged")
     assert "penalty" not in logged[0]
     wanted = {(name, record["step"]) for record in logged for name in record if name != "step"}
     assert scalars(tmp_path / "tensorboard" / "logged") == wanted

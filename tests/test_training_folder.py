@@ -8,20 +8,13 @@ import shutil
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from statespace_config import Killed, kill_at, same
+from statespace_config import SMALL, Killed, arrays, kill_at, same
 
 from sts_jax import mvae, storage, training
 from sts_jax.training import folder as model_folder
 
-SMALL = mvae.Config((mvae.Modality("a", "vector", (3,)), mvae.Modality("b", "vector", (2,))), latent=4, hidden=8)
 CONFIG = training.TrainConfig(steps=4, batch_size=8, log_every=1, checkpoint_every=1)
 IMAGE = np.arange(4 * 4 * 3, dtype=np.uint8).reshape(4, 4, 3)
-
-
-def arrays():
-    rng = np.random.default_rng(0)
-    data = {"a": rng.random((20, 3), np.float32), "b": rng.random((20, 2), np.float32)}
-    return training.Arrays(data, data)
 
 
 def train(workdir, **more):

@@ -8,18 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from statespace_config import TINY, Killed, kill_at, random_codes, random_states, same
+from statespace_config import SMALL, TINY, Killed, arrays, kill_at, random_codes, random_states, same
 
 from sts_jax import mvae, objects, statespace, training
 
-SMALL = mvae.Config((mvae.Modality("a", "vector", (3,)), mvae.Modality("b", "vector", (2,))), latent=4, hidden=8)
 CONFIG = training.TrainConfig(steps=12, batch_size=8, log_every=2, checkpoint_every=4)
-
-
-def arrays(samples=20, seed=0):
-    rng = np.random.default_rng(seed)
-    data = {"a": rng.random((samples, 3), np.float32), "b": rng.random((samples, 2), np.float32)}
-    return training.Arrays(data, data, {"b": rng.random(samples) < 0.5})
 
 
 def files(folder):
