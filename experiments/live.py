@@ -17,6 +17,7 @@ and releases. At the first start, the compilation takes about two minutes for a 
 
 import contextlib
 import dataclasses
+import itertools
 import tempfile
 import time
 from collections.abc import Generator, Iterator
@@ -99,7 +100,7 @@ def check(config: Config) -> None:
 def opened(config: Config) -> Iterator[Source]:
     """Open the source that the options select. A digital twin runs until the end of the `with` block."""
     if config.replay is not None:
-        replay = hardware.Replay(config.replay, speed=config.speed, loop=config.loop)
+        replay = hardware.Replay(config.replay, speed=config.speed)
         yield Source(f"a recording in {config.replay}", replay, config.sensor or config.replay)
     elif config.sensor is not None:
         sensor = hardware.STS.from_file(config.sensor, camera=config.camera, leds=config.leds)
@@ -119,8 +120,12 @@ def images(config: Config, source: Source) -> Generator[hardware.Shot, None, Non
             origin = hardware.Origin.of(sensor)
             recorder = hardware.Recorder(config.record, origin, encoding=config.encoding, file=source.file)
             stack.callback(recorder.close)
-        options = {} if isinstance(sensor, hardware.Replay) else {"dwell": config.dwell}
-        for shot in sensor.stream(**options):
+        if isinstance(sensor, hardware.Replay):
+            laps = itertools.count() if config.loop else range(1)
+            shots = itertools.chain.from_iterable(sensor.connect().stream() for _ in laps)
+        else:
+            shots = sensor.stream(dwell=config.dwell)
+        for shot in shots:
             if recorder is not None:
                 recorder.add(shot)
             yield shot
@@ -135,7 +140,7 @@ def follow(config: Config, source: Source, predictor: sts.Predictor, page: LiveP
     newest, shown, moments = dict[str, hardware.Shot](), dict[str, Image](), list[Image]()
     with (
         Live(predictor, views, config.condition) as live,
-        source.sensor,  # the clock of a replay starts now
+        source.sensor,
         contextlib.closing(images(config, source)) as shots,
     ):
         started_s = printed_s = time.monotonic()

@@ -68,7 +68,7 @@ def test_the_sensor_file_of_the_twin_rectifies_to_the_simulated_view(tmp_path):
         held, pose = sensor.read(), device.state.pose
     made = hardware.Device.load(tmp_path)
     assert sts.Sensor.load(tmp_path / "sensor.json").constants() == sts.Sensor().constants()
-    assert (made.width, made.height, made.leds, made.lens_from) == (320, 240, "TWIN0", "ideal")
+    assert (made.lens.width, made.lens.height, made.leds, made.lens_from) == (320, 240, "TWIN0", "ideal")
     for shot in (pair.visual, pair.tactile):
         background = made.backgrounds(tmp_path)[shot.stream == "tactile"]
         assert np.abs(background - shot.image.astype(float)).mean() < 2

@@ -1,5 +1,6 @@
 """The page for builders: pins as in the firmware, arithmetic that holds, drawings as the script makes them."""
 
+import collections
 import importlib.util
 import re
 from pathlib import Path
@@ -23,7 +24,7 @@ def table(first_column):
         if not line.startswith("|"):
             break
         rows.append([cell.strip() for cell in line.strip("|").split("|")])
-    return [cell.strip() for cell in lines[start].strip("|").split("|")], rows
+    return rows
 
 
 def wired():
@@ -32,7 +33,7 @@ def wired():
 
 
 def test_pins_are_those_that_the_firmware_drives():
-    _, rows = table("channel")
+    rows = table("channel")
     assert {int(row[0]): row[2] for row in rows} == wired()
     ports = re.search(r"PORTD &= ~\((.*?)\);\s+PORTB &= ~(_BV\(PB\d\))", FIRMWARE).group(0)
     driven = {DATA_SHEET[port] for port in re.findall(r"_BV\((P[BD]\d)\)", ports)}
@@ -42,10 +43,8 @@ def test_pins_are_those_that_the_firmware_drives():
 
 
 def test_arithmetic_of_the_strings_holds():
-    heads, rows = table("channel | Vf (V)")
-    assert heads[3] == "R (Ω)"
     total = 0.0
-    for row in rows:
+    for row in table("channel | Vf (V)"):
         forward, ideal, chosen, current, power, strings, channel = map(float, row[1:])
         rest = SUPPLY - 3 * forward
         assert ideal == pytest.approx(rest / WANTED, abs=0.5)
@@ -60,12 +59,11 @@ def test_arithmetic_of_the_strings_holds():
 
 
 def test_resistors_of_the_parts_list_are_those_of_the_strings():
-    _, strings = table("channel | Vf (V)")
-    _, parts = table("part")
+    parts = table("part")
     listed = {int(m.group(1)): int(row[1]) for row in parts if (m := re.match(r"series resistor (\d+) Ω", row[0]))}
-    counted = {}
-    for row in strings:
-        counted[int(row[3])] = counted.get(int(row[3]), 0) + int(row[6])
+    counted = collections.Counter()
+    for row in table("channel | Vf (V)"):
+        counted[int(row[3])] += int(row[6])
     assert listed == counted
 
 
@@ -74,8 +72,7 @@ def test_pulses_of_an_exposure_follow_from_the_timers():
     assert "TCCR0A = _BV(WGM00);" in FIRMWARE
     assert f"a period of {1e6 * period:.1f} µs" in PAGE
     assert f"{1e-3 / period:.1f} kHz" in PAGE
-    _, rows = table("exposure (ms)")
-    for exposure, pulses, difference in rows:
+    for exposure, pulses, difference in table("exposure (ms)"):
         count = 1e-3 * float(exposure) / period
         assert int(pulses) == round(count)
         assert difference == f"{100 / count:.1f} %"
@@ -89,9 +86,5 @@ def test_drawings_are_those_of_the_script(name):
     drawn = {"wiring": drawings.wiring, "side": drawings.side_view}[name]()
     assert (ROOT / "docs" / "hardware" / f"{name}.svg").read_text(encoding="utf-8") == drawn
     if name == "wiring":
-        _, rows = table("channel | Vf (V)")
-        for row in rows:
-            assert f">{row[3]} Ω<" in drawn
-        _, pins = table("channel")
-        for row in pins:
-            assert f">{row[1]}<" in drawn
+        shown = [f"{row[3]} Ω" for row in table("channel | Vf (V)")] + [row[1] for row in table("channel")]
+        assert all(f">{text}<" in drawn for text in shown)

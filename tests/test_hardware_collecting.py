@@ -68,27 +68,18 @@ def check(trajectory, number):
     assert trajectory.initial.tactile.time_s < trajectory.final.visual.time_s
 
 
-def test_trajectories_are_collected_discarded_and_continued(peer, sensor, tmp_path):
+def test_trajectories_are_collected_discarded_continued_and_stopped(peer, sensor, tmp_path):
     player = Player(peer)
     person = Playing(player, bad=[0])
     assert collect(sensor, tmp_path / "session", person, 1) == 1
     assert {view.stage for view in person.views} == set(Stage)
     assert collect(sensor, tmp_path / "session", Playing(player), 2) == 1
-    entries = hardware.list_recordings(tmp_path / "session")
-    assert [(entry.number, entry.standing) for entry in entries] == [
-        (0, "discarded"),
-        (1, "confirmed"),
-        (2, "confirmed"),
-    ]
+    stopping = Playing(player, stop_after=lambda view: view.stage is Stage.STILL)
+    assert collect(sensor, tmp_path / "session", stopping, None) == 0  # the initial pair is kept
+    standings = {entry.number: entry.standing for entry in hardware.list_recordings(tmp_path / "session")}
+    assert standings == {0: "discarded", 1: "confirmed", 2: "confirmed", 3: "incomplete"}
     for trajectory in hardware.load_recordings(tmp_path / "session"):
         check(trajectory, trajectory.number)
-
-
-def test_stopping_in_the_middle_keeps_the_initial_pair(peer, sensor, tmp_path):
-    person = Playing(Player(peer), stop_after=lambda view: view.stage is Stage.STILL)
-    assert collect(sensor, tmp_path / "session", person, None) == 0
-    (entry,) = hardware.list_recordings(tmp_path / "session")
-    assert (entry.number, entry.standing) == (0, "incomplete")
 
 
 @pytest.mark.parametrize("fails", ["write_folder", "write_manifest"])

@@ -5,15 +5,18 @@ import math
 
 import calibration_images
 import cv2
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
+from recorded_session import LENS as SMALL
+from recorded_session import drawn, raw
 from scipy import ndimage
 
 import sts_jax as sts
 from sts_jax import hardware
-from sts_jax.hardware import Lens
+from sts_jax.hardware import Lens, twin
 from sts_jax.hardware import lens as lens_module
 
 PINHOLE = sts.Sensor().camera
@@ -35,16 +38,12 @@ def pixel_of_point(lens, point):
     return lens.fx * d * math.cos(phi) + lens.cx, lens.fy * d * math.sin(phi) + lens.cy
 
 
-def random_points(number=200):
-    return np.random.default_rng(0).uniform([-0.1, -0.1, -0.02], [0.1, 0.1, 0.1], (number, 3))
-
-
 # ---- Model
 
 
 @LENSES
 def test_projection_equals_the_closed_form_and_opencv(lens):
-    points = random_points()
+    points = np.random.default_rng(0).uniform([-0.1, -0.1, -0.02], [0.1, 0.1, 0.1], (200, 3))
     expected = np.array([pixel_of_point(lens, point) for point in points])
     np.testing.assert_allclose(hardware.project(lens, points), expected, atol=1e-9)
     matrix = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]])
@@ -158,33 +157,92 @@ def test_markers_on_the_pad_are_rectified_to_their_pixels(lens):
         np.testing.assert_allclose(centre, np.asarray(expected)[0], atol=0.1)
 
 
-def test_parts_of_the_view_that_the_camera_does_not_see_are_black():
-    lens = Lens.ideal(640, 480, field_of_view=math.radians(60))
-    image = hardware.rectified(lens, PINHOLE, np.full((480, 640), 200, np.uint8), (48, 64))
-    assert (image[0, 0], image[24, 32]) == (0, 200)
-
-
 def test_small_images_are_means_and_show_no_aliasing():
     rows, columns = np.mgrid[:480, :640]
     stripes = np.where((rows + columns) % 2 == 0, 255, 0).astype(np.uint8)
     image = hardware.rectified(IDEAL, PINHOLE, stripes, (16, 16))
     assert np.abs(image.astype(int) - 127).max() < 12
-    pixel = hardware.rectified(IDEAL, PINHOLE, stripes, (1, 1))
-    assert abs(int(pixel[0, 0]) - 127) < 4
     full = hardware.rectified(IDEAL, PINHOLE, smooth_image((480, 640)), (480, 480))
     small = hardware.rectified(IDEAL, PINHOLE, smooth_image((480, 640)), (48, 48))
     means = full.reshape(48, 10, 48, 10, 3).mean(axis=(1, 3))
     assert np.abs(means - small).max() < 1.5
 
 
-def test_raw_pixels_beyond_the_view_have_the_colour_of_the_outside():
+def test_parts_that_the_camera_does_not_see_are_black_and_raw_pixels_beyond_the_view_have_the_outside_colour():
     image = np.full((480, 640, 3), 200, np.uint8)
+    narrow = Lens.ideal(640, 480, field_of_view=math.radians(60))
+    assert hardware.rectified(narrow, PINHOLE, image, (48, 64))[[0, 24], [0, 32], 0].tolist() == [0, 200]
     raw = hardware.distorted(IDEAL, PINHOLE, image, outside=(10, 20, 30))
     assert raw[0, 0].tolist() == [10, 20, 30]
     assert raw[240, 320].tolist() == [200, 200, 200]
     coordinates = hardware.distortion(IDEAL, PINHOLE, (480, 640))
     inside = ((coordinates > -0.5) & (coordinates < [639.5, 479.5])).all(axis=-1)
     assert np.mean(raw[..., 0] == 200) == pytest.approx(inside.mean(), abs=0.01)
+
+
+# ---- Views of a predictor
+
+
+def test_a_raw_pair_becomes_the_views_that_it_was_made_from():
+    visual, tactile = drawn((10, 20), (60, 60, 60)), drawn((30, 40), (220, 90, 40))
+    found = hardware.sensor_view(SMALL, PINHOLE, raw(visual), raw(tactile))
+    for image, truth in ((found.visual, visual), (found.tactile, tactile)):
+        assert image.shape == (64, 64, 3)
+        assert image.dtype == np.float32
+        inside = np.s_[4:-4, 4:-4]  # the raw image is coarser than the view, which blurs edges
+        assert np.median(np.abs(image - truth / 255)[inside]) < 1e-6
+        assert np.abs(image - truth / 255)[inside].mean() < 0.01
+    assert np.abs(found.visual - tactile / 255).mean() > 0.008
+
+
+def test_a_view_is_relit_by_the_ratio_of_the_empty_pads():
+    random = np.random.default_rng(0)
+    view, background, empty = (hardware.SensorView(*random.random((2, 8, 8, 3), np.float32)) for _ in range(3))
+    found = hardware.relit(view, background, empty)
+    for own, image, here, there in zip(found, view, background, empty, strict=True):
+        for place in np.ndindex(image.shape):
+            expected = min(image[place] * there[place] / max(here[place], 1 / 255), 1)
+            assert own[place] == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.slow
+def test_the_view_of_a_twin_is_the_rendering_of_the_pose_and_gives_the_same_prediction():
+    height, width = 480, 640
+    sensor, body = sts.Sensor(), sts.objects.make(jax.random.key(0), "camera")
+    scene = twin.ObjectScene(body, sensor=sensor, resolution=(height, width), motion_rate=0.2)
+    lens = hardware.Lens.ideal(width, height)
+    with twin.Twin(scene, lens=lens) as device:
+
+        def view():
+            images = []
+            for levels in ((0,) * 4, (255,) * 4):
+                device.set(levels)
+                device.step(0.2)
+                exposure, image = device.capture()
+                images.append(image)
+            return exposure.pose, hardware.sensor_view(lens, sensor.camera, *images, (128, 128))
+
+        empties = [view()[1] for _ in range(10)]
+        device.command("hold")
+        pose, found = view()
+    background = hardware.SensorView(*(np.mean(images, axis=0) for images in zip(*empties, strict=True)))
+    wrench = jnp.asarray(scene._motion(0).wrench[0])
+    predict = sts.Predictor.load("freefall")
+    frame = sts.sense(sensor, body, jnp.asarray(pose), wrench, resolution=(128, 128))
+    lit = hardware.relit(found, background, hardware.SensorView(**predict.empty))
+    for stream in ("visual", "tactile"):
+        truth, image = np.asarray(getattr(frame, stream)), getattr(lit, stream)
+        difference, wrong = 255 * np.abs(image - truth), 255 * np.abs(image[:, ::-1] - truth)
+        print(f"{stream}: {difference.mean():.2f} of 255 on average, median {np.median(difference):.2f}")
+        assert difference.mean() < 2
+        assert np.median(difference) < 1.5  # noise of the frame and of the background
+        assert wrong.mean() > 1.5 * difference.mean()
+    plain, own, direct = (
+        np.asarray(predict(visual=image).visual) for image in (found.visual, lit.visual, np.asarray(frame.visual))
+    )
+    apart, without = 255 * np.abs(own - direct).mean(), 255 * np.abs(plain - direct).mean()
+    print(f"predictions: {apart:.2f} of 255 apart, {without:.2f} if the view is not relit")
+    assert apart < without / 3
 
 
 # ---- Errors

@@ -127,6 +127,8 @@ def test_pairs_follow_the_recorded_order(tmp_path):
         for number, epoch in [(0, 0), (1, 0), (3, 0), (2, 0), (4, 0), (6, 0), (7, 0), (8, 0), (9, 1), (10, 1)]:
             one = shot(number, epoch=epoch)
             recorder.add(dataclasses.replace(one, time_s=200 + recorder.counts["visual"] + recorder.counts["tactile"]))
+        with pytest.raises(ValueError, match=r"shape \(4, 4, 3\), but all"):
+            recorder.add(dataclasses.replace(one, image=np.zeros((4, 4, 3), np.uint8)))
     with hardware.Replay(tmp_path / "made", speed=None) as replay:
         pairs = [replay.read() for _ in range(4)]
         with pytest.raises(EOFError, match="has no further pair of images"):
@@ -148,18 +150,6 @@ def test_images_come_at_their_times_and_late_readers_miss_some(folder):
         (first,) = numbers([next(replay.stream())])
         assert first >= 3
         assert replay.skipped == first
-
-
-def test_a_loop_counts_connections(folder):
-    with hardware.Replay(folder, speed=None, loop=True) as replay:
-        found = list(itertools.islice(replay.stream(), 30))
-    assert numbers(found) == [*range(12), *range(12), *range(6)]
-    assert [one.epoch for one in found] == [0] * 12 + [1] * 12 + [2] * 6
-    assert all(b.time_s > a.time_s for a, b in itertools.pairwise(found))
-    with hardware.Recorder(folder.with_name("dark"), ORIGIN) as recorder:
-        recorder.add(shot(0))
-    with hardware.Replay(folder.with_name("dark"), speed=None, loop=True) as replay, pytest.raises(EOFError):
-        replay.read()  # visual images form no pairs
 
 
 @pytest.mark.parametrize("name", ["manifest.json", "frames.jsonl", "visual.mkv", "tactile.mkv"])
@@ -187,22 +177,15 @@ def test_a_damaged_line_of_an_interrupted_recording_is_named(interrupted):
     ("call", "error", "match"),
     [
         (lambda folder: hardware.Recorder(folder, ORIGIN), FileExistsError, "is not an empty folder: give the name"),
-        (lambda folder: record_other_size(folder / "new"), ValueError, r"has shape \(4, 4, 3\), but all images of"),
         (lambda folder: list(record(folder / "n", [])) or hardware.Replay(folder / "n"), ValueError, "has no image"),
         (lambda folder: hardware.Replay(folder / "none"), FileNotFoundError, "holds no recording"),
         (lambda folder: hardware.Replay(folder).read(), RuntimeError, "is not connected: call connect"),
-        (lambda folder: hardware.Replay(folder, speed=0), ValueError, "speed must be > 0 and finite, or None, got 0"),
         (lambda folder: hardware.Replay(folder, speed=math.nan), ValueError, "speed must be > 0 and finite"),
     ],
 )
 def test_bad_input_is_named(folder, call, error, match):
     with pytest.raises(error, match=match):
         call(folder)
-
-
-def record_other_size(folder):
-    with hardware.Recorder(folder, ORIGIN) as recorder:
-        recorder.add(dataclasses.replace(shot(0), image=np.zeros((4, 4, 3), np.uint8)))
 
 
 def test_a_recording_has_a_copy_of_the_sensor_file(tmp_path):

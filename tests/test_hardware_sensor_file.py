@@ -38,8 +38,6 @@ def folder(tmp_path):
 
 
 def test_a_loaded_device_equals_the_saved_one(folder):
-    names = ["background_tactile.png", "background_visual.png", "manifest.json", "sensor.json"]
-    assert sorted(path.name for path in folder.iterdir()) == names
     assert Device.load(folder) == Device.load(folder / "sensor.json") == DEVICE
     np.testing.assert_array_equal(DEVICE.backgrounds(folder), [DARK, LIT])
     with Image.open(folder / "background_visual.png") as image:  # red is first
@@ -57,19 +55,15 @@ def test_the_file_is_also_that_of_a_simulated_sensor(tmp_path):
         Device.load(tmp_path / "other")
 
 
-def test_a_device_can_be_saved_again_with_and_without_its_backgrounds(folder):
+def test_a_device_can_be_copied_and_saved_again_with_and_without_its_backgrounds(folder, tmp_path):
+    assert hardware.copy_sensor(folder, tmp_path / "copy") == hardware.sensor_file.checksums(folder)
     slower = dataclasses.replace(DEVICE, settle_on_s=0.06)
     slower.save(folder, SENSOR)
-    assert Device.load(folder) == slower
-    np.testing.assert_array_equal(slower.backgrounds(folder), [DARK, LIT])
+    for path, device in ((folder, slower), (tmp_path / "copy", DEVICE)):
+        assert Device.load(path) == device
+        np.testing.assert_array_equal(device.backgrounds(path), [DARK, LIT])
     slower.save(folder, SENSOR, (DARK, NEW))
     np.testing.assert_array_equal(slower.backgrounds(folder), [DARK, NEW])
-
-
-def test_a_copy_is_as_good_as_the_original(folder, tmp_path):
-    assert hardware.copy_sensor(folder, tmp_path / "copy") == hardware.sensor_file.checksums(folder)
-    assert Device.load(tmp_path / "copy") == DEVICE
-    np.testing.assert_array_equal(DEVICE.backgrounds(tmp_path / "copy"), [DARK, LIT])
 
 
 @pytest.mark.parametrize("name", ["sensor.json", "background_visual.png", "background_tactile.png", "manifest.json"])
@@ -98,8 +92,8 @@ def test_another_camera_or_controller_is_refused_by_name():
     DEVICE.check_identity()
     DEVICE.check_identity(camera=DEVICE.camera, leds=DEVICE.leds)
     both = rf"camera {re.escape(DEVICE.camera)} and LED controller 1A2B3C4D, but the connected sensor has "
-    with pytest.raises(ValueError, match=both + r"camera /dev/video3: load"):
-        DEVICE.check_identity(camera="/dev/video3", leds=DEVICE.leds)
+    with pytest.raises(ValueError, match=both + r"camera /dev/video3 and LED controller 1A2B3C4D: load"):
+        DEVICE.check_identity(camera="/dev/video3")
     with pytest.raises(ValueError, match=both + "camera /dev/video3 and LED controller FFFF"):
         DEVICE.check_identity(camera="/dev/video3", leds="FFFF")
 
@@ -136,12 +130,10 @@ def test_a_missing_field_takes_its_default(folder):
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"leds": None}, r"device\.leds is None: Input should be a valid string"),
         ({"leds": ""}, r"device\.leds is ''"),
         ({"fps": 0}, r"device\.fps is 0: Input should be greater than 0"),
         ({"settle_off_s": float("nan")}, r"device\.settle_off_s"),
         ({"settle_on_s": 60.5}, r"device\.settle_on_s is 60\.5: Input should be less than 60"),
-        ({"levels": [255, 255, 0]}, r"device\.levels\[3\] is missing"),
         ({"levels": [256, 0, 0, 0.5]}, r"device\.levels\[0\] is 256"),
         ({"commissioned": "yesterday"}, r"device\.commissioned is 'yesterday'"),
         ({"lens__fx": 10**400}, "must be finite"),

@@ -55,7 +55,6 @@ def test_reading_returns_what_was_saved(tmp_path):
         for end, taken in saved.items():
             session.save(0, end, taken)
         session.confirm(0, "on its edge")
-        assert session.confirmed == 1
         read = hardware.load_recordings(tmp_path)  # while another part of the program collects
     (trajectory,) = read
     for end, stream in ((end, stream) for end in saved for stream in ("visual", "tactile")):
@@ -63,13 +62,9 @@ def test_reading_returns_what_was_saved(tmp_path):
         np.testing.assert_array_equal(one.image, two.image)
         assert dataclasses.replace(one, image=two.image).__dict__ == two.__dict__
     assert (trajectory.number, trajectory.note, len(read), read.origin) == (0, "on its edge", 1, ORIGIN)
-    seen = []
-    images = read.images(lambda image: image[::2], lambda done, total: seen.append((done, total)))
+    images = read.images(lambda image: image[::2])
     np.testing.assert_array_equal(images.tactile[0, 1], saved["final"].tactile.image[::2])
     np.testing.assert_array_equal(images.visual[0, 0], saved["initial"].visual.image[::2])
-    assert seen == [(1, 1)]
-    (entry,) = hardware.list_recordings(tmp_path)
-    assert entry.taken.endswith("+00:00")
 
 
 def test_a_session_is_continued_and_its_trajectories_discarded_restored_and_confirmed_later(tmp_path):
@@ -185,20 +180,17 @@ def test_a_full_disk_loses_nothing(small_disk):
     ballast, folder = small_disk / "ballast", small_disk / "session"
     with Session(folder, ORIGIN) as session:
         add(session)
-        ballast.write_bytes(bytes(os.statvfs(small_disk).f_bavail * os.statvfs(small_disk).f_bsize - 16384))
+        ballast.write_bytes(bytes(shutil.disk_usage(small_disk).free - 16384))
         with pytest.raises(OSError, match="only 0 MB are free"):
             session.check_ready()
         number = session.begin()
         with pytest.raises(OSError, match=r"cannot write .*No space left.*Free some disk space"):
             session.save(number, "initial", pair(number, "initial"))
         assert standings(folder) == {0: "confirmed", 1: "incomplete"}
-        with pytest.raises(FileNotFoundError, match="it has no initial pair"):
-            session.confirm(number)
         ballast.unlink()
         for end in ("initial", "final"):
             session.save(number, end, pair(number, end))
         session.confirm(number)
-        assert session.confirmed == 2
     check(hardware.load_recordings(folder)[1])
 
 

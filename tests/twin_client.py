@@ -58,9 +58,6 @@ class Leds:
         check(words[:6] == ["OK", "SET", *map(str, levels)], f"unexpected answer {words}")
         return sent, acknowledged
 
-    def close(self):
-        self._serial.close()
-
 
 def check(holds, message):
     if not holds:
@@ -112,20 +109,20 @@ def judge(frames, changes, log, numbers):
     rows = [log[numbers[frame[0]]] for frame in frames]
     order = [row["index"] for row in rows]
     check(order == sorted(set(order)), f"frames are repeated or out of order: {order}")
-    counts = {"frames": len(frames), "on": 0, "off": 0, "mixed": 0}
+    kinds = [
+        "mixed" if row["highest"] - row["lowest"] > 1e-3 else "on" if row["light"] > 0.5 else "off" for row in rows
+    ]
+    counts = {"frames": len(frames)} | {kind: kinds.count(kind) for kind in ("on", "off", "mixed")}
+    check(counts["on"] and counts["off"], "no frames with the light on, or none with the light off")
     bright, dark = (
-        [f[1:4] for f, row in zip(frames, rows, strict=True) if low <= row["lowest"] <= row["highest"] <= high]
-        for low, high in ((0.9999, 1), (0, 1e-4))
+        [sum(f[i] for f, k in zip(frames, kinds, strict=True) if k == kind) / counts[kind] for i in (1, 2, 3)]
+        for kind in ("on", "off")
     )
-    check(bright and dark, "no frames with the light on, or none with the light off")
-    bright, dark = ([sum(values) / len(values) for values in zip(*means, strict=True)] for means in (bright, dark))
-    for frame, row in zip(frames, rows, strict=True):
+    for frame, row, kind in zip(frames, rows, kinds, strict=True):
         check(frame[4] >= row["due_s"], f"frame {row['index']} arrived before its time")
         levels = commanded(changes, row["start_s"], row["end_s"])
         if levels is not None:
             check(abs(row["light"] - levels[0] / 255) < 1e-3, f"frame {row['index']}: {levels} against {row}")
-        kind = "mixed" if row["highest"] - row["lowest"] > 1e-3 else "on" if row["light"] > 0.5 else "off"
-        counts[kind] += 1
         for mean, ends in zip(frame[1:4], zip(dark, bright, strict=True), strict=True):
             check(min(ends) - 1 <= mean <= max(ends) + 1, f"frame {row['index']} is {mean}, beyond {ends}")
             if kind != "mixed":
@@ -147,7 +144,6 @@ def main():
     check(leds.request("WATCH 10000")[0] == ["OK", "WATCH", "10000"], "the watchdog's period was not set")
     frames, changes = look(leds, options.camera, options.switches)
     leds.set(OFF)
-    leds.close()
     with open(options.log) as file:
         log = [json.loads(line) for line in file]
     print(json.dumps(judge(frames, changes, log, recorded(options.record))))

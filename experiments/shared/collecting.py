@@ -18,7 +18,7 @@ from experiments.shared.page import CollectPage
 from experiments.shared.run import Folder
 from experiments.shared.terminal import Bar, Terminal, say
 from sts_jax import hardware, storage
-from sts_jax.hardware import AutomaticPerson, EmptyPad, GuideConfig, Person, View, twin
+from sts_jax.hardware import Action, AutomaticPerson, EmptyPad, GuideConfig, Person, Stage, View, twin
 
 SHEET = 20  # number of trajectories, the newest ones, that `--sheet` draws by default
 PANEL = 200  # width of an image on the sheet (pixels)
@@ -29,6 +29,10 @@ TWIN_RATE = 15.0  # frame rate of a collecting twin (frames/s). The guide needs 
 # guide does not take the object for one at rest.
 MOTION_RATE = 4.0
 LEVELS = (255, 255, 255, 255)  # duty cycles of the twin's LED channels in the tactile stream
+_PATIENCE_S = 60.0  # longest wait of the twin's hand for a new instruction (s on the twin's clock)
+_UNSEEN_S = 3.0  # time without a visible contact after which the next held pose is tried (s)
+_UNSEEN = 10  # held poses in a row without a visible contact after which the hand gives up
+_UNMOVED_S = 3.0  # time without motion after a release after which the object counts as resting where it was (s)
 _WAIT_S = 0.1  # time of the computer's clock between two attempts while the session cannot be written (s)
 
 
@@ -150,28 +154,73 @@ class Automatic(AutomaticPerson):
         super().show(view)
         self._other.show(view)
 
-    def action(self) -> hardware.Action | None:
+    def action(self) -> Action | None:
         """The action of the other person, or the automatic one."""
         return self._other.action() or super().action()
 
 
-class Hand(twin.Hand):
-    """Moves the object of a twin as `hardware.collect` instructs, and shows the collection's progress."""
+class Hand(AutomaticPerson):
+    """Replaces the person: moves the object of a twin as `hardware.collect` instructs, and shows the progress.
 
-    def __init__(self, device: twin.Twin, session: hardware.Session, bar: Bar, count: int):
-        super().__init__(device, session)
-        self._bar, self._count = bar, count
+    If no contact is seen within 3 s, the hand tries the first pose of the next trajectory, and the number stays unused
+    in the session, so that a trajectory has the same number in session and scene.
+    """
+
+    def __init__(
+        self, device: twin.Twin, session: hardware.Session, bar: Bar, count: int, *, patience_s: float = _PATIENCE_S
+    ):
+        super().__init__()
+        self._device, self._session, self._bar, self._count = device, session, bar, count
+        self._patience_s = patience_s
+        self._seen: Stage | None = None  # stage of the last view
+        self._since_s = self._now_s = 0.0  # begin of that stage, and time of the last view (s)
+        self._placed = False  # True if the object is on the pad
+        self._held_s: float | None = None  # time since which the object is held without a problem of the session (s)
+        self._unseen = 0  # held poses in a row without a visible contact
         self._problem: str | None = None
 
     def show(self, view: View) -> None:
-        """Move the object, and show the number of confirmed trajectories, or an error that prevents collecting."""
+        """Move the object as the newest instruction requires. Raises an error if the collection does not go on."""
         super().show(view)
         self._bar("collect", view.confirmed, self._count)
+        self._now_s = self._device.now_s
+        if view.stage is not self._seen or view.problem is not None:
+            self._seen, self._since_s = view.stage, self._now_s
         if view.problem is not None:
+            self._held_s = None if self._held_s is None else self._now_s
             if self._problem is None:
                 say(view.problem)
             time.sleep(_WAIT_S)
         self._problem = view.problem
+        if view.stage is Stage.CLEAR and self._placed:
+            self._device.command("clear")
+            self._placed, self._held_s = False, None
+        elif view.stage is Stage.PLACE:
+            self._place()
+        elif view.stage is Stage.RELEASE and self._held_s is not None:
+            self._device.command("release")
+            self._held_s, self._unseen = None, 0
+        if self._now_s - self._since_s > self._patience_s or self._unseen == _UNSEEN:
+            raise ValueError(
+                f"no progress after `{view.instruction}` for {self._now_s - self._since_s:.1f} s and {self._unseen} "
+                f"held poses without visible contact (contact: {view.contact}, still: {view.still}): change GuideConfig"
+            )
+
+    def action(self) -> Action | None:
+        """Confirm a trajectory that waits for its review, or a release after which nothing has moved for 3 s."""
+        if self._seen is Stage.RELEASE and self._now_s - self._since_s > _UNMOVED_S:
+            return Action.CONFIRM
+        return super().action()
+
+    def _place(self) -> None:
+        """Hold the object in the next pose, unless the guide may still see the contact of the current one."""
+        if self._held_s is not None:
+            if self._now_s - self._held_s <= _UNSEEN_S:
+                return
+            self._unseen += 1
+            self._session.begin()
+        self._placed, self._held_s = True, self._now_s
+        self._device.command("hold")
 
 
 def simulate(config: Collect) -> None:
@@ -215,10 +264,10 @@ def commissioned(config: Collect, device: twin.Twin) -> tuple[twin.VirtualSensor
     if file.exists():
         there = hardware.Device.load(file)
         there.check_identity(camera=twin.CAMERA, leds=device.serial_number)
-        if (there.width, there.height) != config.size:
+        if (there.lens.width, there.lens.height) != config.size:
             raise ValueError(
-                f"{file} is for images of {there.width} x {there.height} pixels, but --size is {config.size}: change "
-                "it, or choose another --workdir"
+                f"{file} is for images of {there.lens.width} x {there.lens.height} pixels, but --size is {config.size}: "
+                "change it, or choose another --workdir"
             )
         settling = hardware.Settling(there.settle_off_s, there.settle_on_s)
     sensor = twin.VirtualSensor(device, levels=LEVELS, settling=settling)

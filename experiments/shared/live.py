@@ -20,7 +20,7 @@ from jaxtyping import Array, ArrayLike, Float, UInt8
 
 import sts_jax as sts
 from sts_jax import hardware
-from sts_jax.hardware import guide
+from sts_jax.hardware import collecting
 
 SIDE = 384  # side of the images that are shown (pixels)
 _RECENT = 400  # number of predictions from which their rate and latency are computed
@@ -93,17 +93,15 @@ class Views:
         """Rectify a raw image for display, to (SIDE, SIDE, 3)."""
         return hardware.rectified(self.lens, self.pinhole, image, (SIDE, SIDE))
 
-    def rectified(self, images: tuple[Image, Image], size: tuple[int, int]) -> hardware.SensorView:
-        """Rectify a raw visual and a raw tactile image, to float32 RGB in [0, 1]."""
-        rectified = (hardware.rectified(self.lens, self.pinhole, image, size) for image in images)
-        return hardware.SensorView(*(image.astype(np.float32) / 255 for image in rectified))
-
     def prepared(self, visual: Image, tactile: Image, empty: Mapping[str, np.ndarray]) -> hardware.SensorView:
         """Convert raw images to the inputs of a model whose empty sensor looks like `empty` (`Predictor.empty`)."""
         model = hardware.SensorView(**empty)
         rows, columns = model.visual.shape[:2]
-        view = self.rectified((visual, tactile), (rows, columns))
-        return hardware.relit(view, self.rectified(self.empty, (rows, columns)), model) if self.divided else view
+        view, background = (
+            hardware.sensor_view(self.lens, self.pinhole, *pair, (rows, columns))
+            for pair in ((visual, tactile), self.empty)
+        )
+        return hardware.relit(view, background, model) if self.divided else view
 
 
 class Live:
@@ -174,8 +172,8 @@ class Live:
 
     def _predict(self, visual: hardware.Shot, tactile: hardware.Shot) -> Predicted:
         """Predict from raw images."""
-        observation = guide.observe(tactile.time_s, visual.image, tactile.image)
-        contact = guide.has_contact(hardware.GuideConfig(), self._empty, observation)
+        observation = collecting.observe(tactile.time_s, visual.image, tactile.image)
+        contact = collecting.has_contact(hardware.GuideConfig(), self._empty, observation)
         change = np.abs(observation.visual - self._empty.mean.visual).max(-1)
         view = self._views.prepared(visual.image, tactile.image, self._untouched)
         out = self._compute(view._asdict(), contact=contact)

@@ -4,7 +4,6 @@ from sts_jax.hardware.calibration import Board as Board
 from sts_jax.hardware.calibration import CalibrationError as CalibrationError
 from sts_jax.hardware.calibration import FoundCorners as FoundCorners
 from sts_jax.hardware.calibration import board_image as board_image
-from sts_jax.hardware.calibration import calibrate as calibrate
 from sts_jax.hardware.calibration import check_view as check_view
 from sts_jax.hardware.calibration import covered as covered
 from sts_jax.hardware.calibration import find_board as find_board
@@ -24,14 +23,14 @@ from sts_jax.hardware.camera import StaleFrameError as StaleFrameError
 from sts_jax.hardware.camera import find_cameras as find_cameras
 from sts_jax.hardware.collecting import Action as Action
 from sts_jax.hardware.collecting import AutomaticPerson as AutomaticPerson
+from sts_jax.hardware.collecting import EmptyPad as EmptyPad
+from sts_jax.hardware.collecting import GuideConfig as GuideConfig
 from sts_jax.hardware.collecting import PairReader as PairReader
 from sts_jax.hardware.collecting import Person as Person
+from sts_jax.hardware.collecting import Stage as Stage
 from sts_jax.hardware.collecting import View as View
 from sts_jax.hardware.collecting import collect as collect
-from sts_jax.hardware.guide import EmptyPad as EmptyPad
-from sts_jax.hardware.guide import GuideConfig as GuideConfig
-from sts_jax.hardware.guide import Stage as Stage
-from sts_jax.hardware.guide import known_pad as known_pad
+from sts_jax.hardware.collecting import known_pad as known_pad
 from sts_jax.hardware.leds import DisconnectedError as DisconnectedError
 from sts_jax.hardware.leds import LedError as LedError
 from sts_jax.hardware.leds import Leds as Leds

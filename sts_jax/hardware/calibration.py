@@ -111,11 +111,10 @@ def board_image(board: Board = Board()) -> UInt8[np.ndarray, "2970 2100"]:
     The middle of the board is that of the frame, and its dimensions are printed as text.
     """
     width, height = (round(1000 * side * _PIXELS_PER_MM) for side in board.size)
+    size = " x ".join(f"{1000 * side:g} mm" for side in board.size)
     frame = _FRAME * _PIXELS_PER_MM
     if max(width, height) > frame:
-        raise ValueError(
-            f"the board is {_mm(board.size)}, but must fit in the frame of {_FRAME} mm: use smaller squares"
-        )
+        raise ValueError(f"the board is {size}, but must fit in the frame of {_FRAME} mm: use smaller squares")
     page = np.full((_PAGE[1] * _PIXELS_PER_MM, _PAGE[0] * _PIXELS_PER_MM), 255, np.uint8)
     left, top = (page.shape[1] - frame) // 2, 10 * _PIXELS_PER_MM
     cv2.rectangle(page, (left - 1, top - 1), (left + frame, top + frame), 160, 1)
@@ -125,7 +124,7 @@ def board_image(board: Board = Board()) -> UInt8[np.ndarray, "2970 2100"]:
     for line in (
         f"{board.columns} x {board.rows} squares of {1000 * board.square:g} mm, markers of {1000 * board.marker:g} mm "
         f"({board.dictionary})",
-        f"Board {_mm(board.size)}, grey frame {_FRAME} mm x {_FRAME} mm",
+        f"Board {size}, grey frame {_FRAME} mm x {_FRAME} mm",
         f"Print at 100 %. The line below is {_RULER} mm long.",
     ):
         cv2.putText(page, line, (left, row), cv2.FONT_HERSHEY_SIMPLEX, 1.2, 0, 2, cv2.LINE_AA)
@@ -160,11 +159,6 @@ def find_board(image: UInt8[np.ndarray, "rows columns *channels"], board: Board 
     return FoundCorners(numbers.reshape(-1).astype(np.int64), pixels.reshape(-1, 2).astype(np.float64))
 
 
-def _mm(size: Sequence[float]) -> str:
-    """A size in m as a text such as "150 mm x 150 mm"."""
-    return " x ".join(f"{1000 * side:g} mm" for side in size)
-
-
 @dataclasses.dataclass(frozen=True)
 class Calibration:
     """A calibrated lens, and measures of the quality of the calibration."""
@@ -175,32 +169,6 @@ class Calibration:
     largest_angle: float  # largest angle of a corner from the optical axis, beyond which the lens is extrapolated (rad)
 
 
-def calibrate(
-    images: Sequence[UInt8[np.ndarray, "..."]], board: Board = Board(), *, on_pad: int = 0, largest_error: float = 1.0
-) -> Calibration:
-    """Calibrate a lens and the camera's pose in the sensor from raw images of a board.
-
-    In the image `on_pad`, the board lies on the outer face of the gel pad, with the print towards the camera, centred,
-    and with its edges parallel to those of the pad (in any of the four orientations). Among the other images, the
-    distance, position and tilt of the board vary.
-
-    Args:
-        images: At least 6 raw images of one camera and one size, RGB or grey, that show 12 corners of the board.
-        board: The printed board.
-        on_pad: Index of the image in which the board lies on the pad.
-        largest_error: Largest allowed root mean square of the reprojection errors of an image (pixels).
-
-    Raises:
-        CalibrationError: The images do not determine the lens. The message names the images.
-    """
-    sizes = sorted({image.shape[1::-1] for image in images})
-    if len(sizes) > 1:
-        raise ValueError(f"all images must have the same size, got {sizes} pixels: use one setting of the camera")
-    height, width = images[0].shape[:2] if images else (1, 1)
-    corners = [find_board(image, board) for image in images]
-    return fit_lens(corners, (width, height), board, on_pad=on_pad, largest_error=largest_error)
-
-
 def fit_lens(
     corners: Sequence[FoundCorners],
     size: tuple[int, int],
@@ -209,9 +177,20 @@ def fit_lens(
     on_pad: int = 0,
     largest_error: float = 1.0,
 ) -> Calibration:
-    """Calibrate a lens as `calibrate` does, from the corners of `find_board` in raw images of the width and height.
+    """Calibrate a lens and the camera's pose in the sensor from the corners of a board in raw images.
 
-    The fit minimises a soft L1 loss of the distances between the found corners and their projections.
+    The fit minimises a soft L1 loss of the distances between the found corners and their projections. In the image
+    `on_pad`, the board lies on the outer face of the gel pad, with the print towards the camera, centred, and with its
+    edges parallel to those of the pad (in any of the four orientations). Among the other images, the distance, position
+    and tilt of the board vary.
+
+    Args:
+        corners: Results of `find_board` for at least 6 raw images that show 12 corners of the board.
+        size: Width and height of the raw images (pixels).
+        largest_error: Largest allowed root mean square of the reprojection errors of an image (pixels).
+
+    Raises:
+        CalibrationError: The images do not determine the lens. The message names the images.
     """
     width, height = size
     if not 0 <= on_pad < max(1, len(corners)):
@@ -265,8 +244,7 @@ class _Views(NamedTuple):
 
 def _first_estimate(views: _Views, width: int, height: int) -> np.ndarray:
     """The equidistant lens of `_STARTS` that fits best, with the pose of the board in each image, as unknowns."""
-    best: np.ndarray | None = None
-    smallest = math.inf
+    best, smallest = np.zeros(0), math.inf
     for field_of_view in _STARTS:
         focal, middle = math.hypot(width, height) / field_of_view, ((width - 1) / 2, (height - 1) / 2)
         offset = (views.pixels - middle) / focal
@@ -284,10 +262,10 @@ def _first_estimate(views: _Views, width: int, height: int) -> np.ndarray:
                 break
             unknowns += [rotation.ravel(), translation.ravel()]
         else:
-            error = np.abs(views.residuals(np.concatenate(unknowns))[0]).mean()
-            if error < smallest:
-                best, smallest = np.concatenate(unknowns), error
-    if best is None:
+            estimate = np.concatenate(unknowns)
+            error = float(np.abs(views.residuals(estimate)[0]).mean())
+            best, smallest = min((best, smallest), (estimate, error), key=lambda candidate: candidate[1])
+    if not best.size:
         raise CalibrationError(f"the pose of the board cannot be computed from the corners that were found: {_SHARP}")
     return best
 
@@ -305,18 +283,15 @@ def _usable(counts: tuple[int, ...], on_pad: int) -> list[int]:
 
 
 def _check_errors(errors: list[float | None], largest: float) -> None:
-    bad = ", ".join(
-        f"{i} ({error:.2f} pixels)" for i, error in enumerate(errors) if error is not None and error > largest
-    )
+    bad = [f"{i} ({error:.2f} pixels)" for i, error in enumerate(errors) if error is not None and error > largest]
     if bad:
         raise CalibrationError(
-            f"the reprojection error exceeds {largest:g} pixels in images {bad}: leave them out, or check that the "
-            "board is flat, that its squares have the size `Board.square`, and that the focus did not change"
+            f"the reprojection error exceeds {largest:g} pixels in images {', '.join(bad)}: leave them out, or check "
+            "that the board is flat, that its squares have the size `Board.square`, and that the focus did not change"
         )
 
 
 def _check_tilts(poses: np.ndarray) -> None:
-    """Raise an error if the boards are nearly parallel in all images."""
     normals = Rotation.from_rotvec(poses[:, :3]).as_matrix()[:, :, 2]
     spread = math.acos(float(np.clip((normals @ normals.T).min(), -1, 1)))
     if spread < LEAST_TILT:
@@ -356,13 +331,7 @@ def view_angle(lens: Lens, pinhole: Camera) -> float:
 def check_view(lens: Lens, pinhole: Camera, largest_angle: float | None = None) -> None:
     """Check that the camera sees the whole view and that the calibration images cover the corners of the view.
 
-    Args:
-        lens: The lens and the pose of the real camera.
-        pinhole: The simulated camera that defines the view, from `Sensor.camera`.
-        largest_angle: `Calibration.largest_angle`, which the view may exceed by 3 degrees (rad). None: not checked.
-
-    Raises:
-        CalibrationError: A part of the view is not in the image, or beyond the corners of all calibration images.
+    The view may exceed `largest_angle` (rad), from `Calibration`, by 3 degrees.
     """
     needed = view_angle(lens, pinhole)
     if largest_angle is not None and needed > largest_angle + _EXTRAPOLATION:

@@ -8,7 +8,7 @@ their rays meet the gel's outer face (z = 0 in the sensor frame) at the same poi
 import dataclasses
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -68,12 +68,11 @@ class Lens:
     ) -> "Lens":
         """Return an equidistant lens whose optical axis is perpendicular to the pad and meets the centre of the pad.
 
+        The defaults are those of the paper's sensor and code (Rezaei-Shoshtari et al. 2021).
+
         Args:
-            width: Width of the raw image (pixels).
-            height: Height of the raw image (pixels).
-            field_of_view: Field of view across the image's diagonal, in (0, 2 pi] (rad). The default is that of the
-                paper's sensor (Rezaei-Shoshtari et al. 2021).
-            distance: Distance from the camera to the gel's outer face (m). The default is that of the paper's code.
+            field_of_view: Field of view across the diagonal of an image of `width` x `height` pixels (rad).
+            distance: Distance from the camera to the gel's outer face (m).
         """
         if not 0 < field_of_view <= 2 * math.pi:
             raise ValueError(f"field_of_view must be in (0, 2 pi] rad, got {field_of_view}")
@@ -91,10 +90,12 @@ class Lens:
         """Position of the camera in the sensor frame (m)."""
         return -self.matrix.T @ np.asarray(self.translation)
 
-    @property
+    @functools.cached_property
     def largest_angle(self) -> float:
-        """Largest angle from the optical axis at which the model is valid (rad): beyond it, d(a) falls."""
-        return _largest_angle(self.k)
+        """Largest angle from the optical axis at which the model is valid (rad), at most pi: beyond it, d(a) falls."""
+        roots = np.roots([9 * self.k[3], 7 * self.k[2], 5 * self.k[1], 3 * self.k[0], 1.0])  # of the derivative
+        real = roots[(np.abs(roots.imag) < 1e-9 * np.maximum(1, np.abs(roots))) & (roots.real > 0)].real
+        return min([math.pi, *np.sqrt(real).tolist()])
 
 
 @checked
@@ -116,7 +117,7 @@ def directions(lens: Lens, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarra
     """Unit vectors of the rays of raw pixels in the camera frame, NaN beyond the lens. Inverse of `project_camera`."""
     x, y = (pixels[..., 0] - lens.cx) / lens.fx, (pixels[..., 1] - lens.cy) / lens.fy
     radius = np.hypot(x, y)
-    angle = _undistort_angle(lens.k, radius)
+    angle = _undistort_angle(lens, radius)
     ratio = np.sin(angle) / np.where(radius > 0, radius, 1)
     return np.stack([ratio * x, ratio * y, np.cos(angle)], axis=-1)
 
@@ -128,10 +129,7 @@ def rectification(lens: Lens, pinhole: Camera, resolution: tuple[int, int]) -> F
     rows, columns = resolution
     x = left + (np.arange(columns) + 0.5) / columns * width
     y = top + (np.arange(rows) + 0.5) / rows * height
-    pixels = np.empty((rows, columns, 2), np.float32)
-    for first in range(0, rows, _BAND):
-        grid_x, grid_y = np.meshgrid(x, y[first : first + _BAND])
-        pixels[first : first + _BAND] = project(lens, np.stack([grid_x, grid_y, np.zeros_like(grid_x)], axis=-1))
+    pixels = _over_grid(x, y, lambda face: project(lens, np.concatenate([face, np.zeros_like(face[..., :1])], axis=-1)))
     if np.isnan(pixels).any():
         raise ValueError(
             f"the model of the lens is valid up to {math.degrees(lens.largest_angle):.1f} degrees from the optical "
@@ -144,7 +142,7 @@ def rectification(lens: Lens, pinhole: Camera, resolution: tuple[int, int]) -> F
 def rectified(
     lens: Lens, pinhole: Camera, image: Raw, resolution: tuple[int, int]
 ) -> UInt8[np.ndarray, "height width *channels"]:
-    """Rectify a raw image: convert the image of the real camera to the view of the simulated pinhole camera.
+    """Convert a raw image of the real camera to the view of the simulated pinhole camera.
 
     Each rectified pixel is the mean of samples that are at most about one raw pixel apart, so small images show no
     aliasing. Parts of the view that the camera does not see are black.
@@ -154,9 +152,7 @@ def rectified(
             f"the image has {image.shape[1]}x{image.shape[0]} pixels, but the lens was calibrated with images of "
             f"{lens.width}x{lens.height} pixels: set the camera to this size, or calibrate the lens again"
         )
-    maps = _rectifying_maps(lens, _plain(pinhole), resolution)
-    sampled = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-    return _averaged(sampled, resolution)
+    return _remapped(image, _rectifying_maps(lens, _plain(pinhole), resolution), resolution, 0)
 
 
 def distortion(
@@ -171,14 +167,14 @@ def distortion(
     scale = np.array([resolution[1] / width, resolution[0] / height])
     x = (np.arange(lens.width * samples) + 0.5) / samples - 0.5
     y = (np.arange(lens.height * samples) + 0.5) / samples - 0.5
-    pixels = np.empty((len(y), len(x), 2), np.float32)
-    for first in range(0, len(y), _BAND):
-        grid = np.stack(np.meshgrid(x, y[first : first + _BAND]), axis=-1)
-        rays = directions(lens, grid) @ lens.matrix  # in the sensor frame
+
+    def rectified_pixels(raw: np.ndarray) -> np.ndarray:
+        rays = directions(lens, raw) @ lens.matrix  # in the sensor frame
         outwards = np.where(rays[..., 2] > _GRAZING, rays[..., 2], np.nan)
         on_face = lens.center[:2] - lens.center[2] / outwards[..., None] * rays[..., :2]
-        pixels[first : first + _BAND] = (on_face - np.array([left, top])) * scale - 0.5
-    return pixels
+        return (on_face - np.array([left, top])) * scale - 0.5
+
+    return _over_grid(x, y, rectified_pixels)
 
 
 @checked
@@ -193,16 +189,18 @@ def distorted(
     """Convert a rectified image to the raw image that the real camera would take of it. Inverse of `rectified`.
 
     Args:
-        lens: The lens and the pose of the real camera.
-        pinhole: The simulated camera that defines the view.
-        image: Rectified image of the whole view, uint8 or uint16.
         outside: Grey value or RGB colour of the raw pixels outside of the view.
         most_samples: Limit of the samples per raw pixel in each direction. None: as many as avoid aliasing.
     """
     maps = _distorting_maps(lens, _plain(pinhole), image.shape[:2], most_samples)
     colour = (outside,) * 4 if isinstance(outside, int | float) else outside
-    sampled = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=colour)
-    return _averaged(sampled, (lens.height, lens.width))
+    return _remapped(image, maps, (lens.height, lens.width), colour)
+
+
+def _over_grid(x: np.ndarray, y: np.ndarray, values: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """The values of a function of points (rows, columns, 2) on a grid, band by band, as float32."""
+    bands = (np.stack(np.meshgrid(x, y[first : first + _BAND]), axis=-1) for first in range(0, len(y), _BAND))
+    return np.concatenate([values(points).astype(np.float32) for points in bands])
 
 
 def window(pinhole: Camera, resolution: tuple[int, int]) -> tuple[float, float, float, float]:
@@ -260,11 +258,10 @@ def _fixed_point(coordinates: np.ndarray, size: tuple[int, int]) -> Maps:
     return whole, fraction
 
 
-def _averaged(image: np.ndarray, resolution: tuple[int, int]) -> np.ndarray:
-    """Average the samples of each pixel."""
-    if image.shape[:2] == resolution:
-        return image
-    return cv2.resize(image, resolution[::-1], interpolation=cv2.INTER_AREA)
+def _remapped(image: np.ndarray, maps: Maps, resolution: tuple[int, int], outside: object) -> np.ndarray:
+    """Sample an image, and average the samples of each pixel."""
+    image = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=outside)
+    return image if image.shape[:2] == resolution else cv2.resize(image, resolution[::-1], interpolation=cv2.INTER_AREA)
 
 
 def distort_angle(k: Sequence[float], angle: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
@@ -273,9 +270,9 @@ def distort_angle(k: Sequence[float], angle: Float[np.ndarray, "*n"]) -> Float[n
     return angle * (1 + square * (k[0] + square * (k[1] + square * (k[2] + square * k[3]))))
 
 
-def _undistort_angle(k: tuple[float, ...], distorted_angle: np.ndarray) -> np.ndarray:
+def _undistort_angle(lens: Lens, distorted_angle: np.ndarray) -> np.ndarray:
     """Invert `distort_angle` by Newton's method, which starts from a table. NaN beyond the largest angle."""
-    largest = _largest_angle(k)
+    k, largest = lens.k, lens.largest_angle
     angles = np.linspace(0, largest, _TABLE)
     table = distort_angle(k, angles)
     angle = np.interp(distorted_angle, table, angles)
@@ -285,14 +282,6 @@ def _undistort_angle(k: tuple[float, ...], distorted_angle: np.ndarray) -> np.nd
         step = (distort_angle(k, angle) - distorted_angle) / np.maximum(slope, 1e-6)
         angle = np.clip(angle - np.clip(step, -largest / _TABLE, largest / _TABLE), 0, largest)
     return np.where(distorted_angle <= table[-1], angle, np.nan)
-
-
-@functools.lru_cache(maxsize=32)
-def _largest_angle(k: tuple[float, ...]) -> float:
-    """The smallest positive root of the derivative of `distort_angle`, at most pi."""
-    roots = np.roots([9 * k[3], 7 * k[2], 5 * k[1], 3 * k[0], 1.0])
-    real = roots[(np.abs(roots.imag) < 1e-9 * np.maximum(1, np.abs(roots))) & (roots.real > 0)].real
-    return min([math.pi, *np.sqrt(real).tolist()])
 
 
 class SensorView(NamedTuple):
@@ -310,8 +299,8 @@ def sensor_view(
     resolution: tuple[int, int] = (64, 64),
 ) -> SensorView:
     """Rectify a raw visual image and a raw tactile image, such as `pair.visual.image` and `pair.tactile.image`."""
-    images = (rectified(lens, pinhole, image, resolution) for image in (visual, tactile))
-    return SensorView(*(image.astype(np.float32) / 255 for image in images))
+    views = [rectified(lens, pinhole, image, resolution).astype(np.float32) / 255 for image in (visual, tactile)]
+    return SensorView(*views)
 
 
 def relit(view: SensorView, background: SensorView, empty: SensorView) -> SensorView:
@@ -320,14 +309,7 @@ def relit(view: SensorView, background: SensorView, empty: SensorView) -> Sensor
     A model regards every difference from its own empty pad as part of an object, such as the vignetting of another
     camera. The result is clipped to [0, 1].
 
-    Args:
-        view: Rectified images of a sensor.
-        background: Rectified images of the same sensor's empty pad.
-        empty: Images of the empty pad with which the model was trained, `SensorView(**predictor.empty)`.
+    `background` is the same sensor's empty pad. `empty` is that of the training, `SensorView(**predictor.empty)`.
     """
-    return SensorView(
-        *(
-            np.clip(image * there / np.maximum(here, 1 / 255), 0, 1)
-            for image, here, there in zip(view, background, empty, strict=True)
-        )
-    )
+    streams = zip(view, background, empty, strict=True)
+    return SensorView(*(np.clip(image * to / np.maximum(of, 1 / 255), 0, 1) for image, of, to in streams))

@@ -12,11 +12,9 @@ frames.jsonl whose image is in a video.
 
 import contextlib
 import dataclasses
-import itertools
 import json
 import math
 import os
-import statistics
 import time
 from collections.abc import Iterator
 from fractions import Fraction
@@ -93,7 +91,7 @@ class Recorder:
             )
         self._start_s = shot.time_s if self._start_s is None else self._start_s
         try:
-            container, video = self._videos.get(shot.stream) or self._video(shot.stream)
+            container, video = self._videos.get(shot.stream) or self._begin(shot.stream)
             frame = av.VideoFrame.from_ndarray(shot.image, format="rgb24").reformat(format=video.pix_fmt)
             frame.pts = round(1000 * (shot.time_s - self._start_s))
             container.mux(video.encode(frame))
@@ -106,8 +104,7 @@ class Recorder:
             ) from error
         self.counts[shot.stream] += 1
 
-    def _video(self, stream: Stream) -> tuple[av.container.OutputContainer, av.VideoStream]:
-        """Begin the video of a stream."""
+    def _begin(self, stream: Stream) -> tuple[av.container.OutputContainer, av.VideoStream]:
         container = av.open(str(self.folder / f"{stream}.mkv"), "w", format="matroska", options=_PER_IMAGE)
         pixels, options = _CODECS[self._encoding]
         video = container.add_stream(self._encoding, options=options)
@@ -118,7 +115,6 @@ class Recorder:
         return self._videos[stream]
 
     def _end(self) -> None:
-        """Close the files."""
         self._open = False
         self._lines.close()
         while self._videos:
@@ -154,23 +150,21 @@ class Replay:
     of the replay on the clock `time.monotonic`.
     """
 
-    def __init__(self, folder: str | os.PathLike, *, speed: float | None = 1.0, loop: bool = False):
+    def __init__(self, folder: str | os.PathLike, *, speed: float | None = 1.0):
         """Open a recording, and compare its checksums.
 
         Args:
             speed: Seconds of the recording that are played per second, > 0. None: as fast as the program reads,
                 without missing images.
-            loop: If True, the replay continues from the beginning after the end of the recording, with a larger
-                `Shot.epoch`.
         """
         if speed is not None and not (speed > 0 and math.isfinite(speed)):
             raise ValueError(f"speed must be > 0 and finite, or None, got {speed}")
-        self.folder, self._speed, self._loop = Path(folder), speed, loop
+        self.folder, self._speed = Path(folder), speed
         self._stills = _recorded(self.folder)
         if not self._stills:
             raise ValueError(f"{self.folder} has no image: make a new recording.")
         self._shots: Iterator[Shot] | None = None
-        self.skipped = 0  # images since `connect` that were left out because the program read too slowly
+        self.skipped = 0  # images that were left out because the program read too slowly
 
     @property
     def device(self) -> Device | None:
@@ -179,7 +173,6 @@ class Replay:
 
     def connect(self) -> "Replay":
         """Start the replay, or start it again from the beginning."""
-        self.skipped = 0
         self._shots = self._play(time.monotonic())
         return self
 
@@ -196,14 +189,14 @@ class Replay:
         With `speed=None`, it is the next pair. At the end of the recording, `EOFError` is raised.
         """
         called_s, last = time.monotonic(), None
-        for shot in itertools.islice(self.stream(), 2 * len(self._stills)):
+        for shot in self.stream():
             if self._speed is not None and shot.time_s < called_s:
                 continue
             connection = shot.epoch, shot.before.boot
             if last is not None and last.stream != shot.stream and connection == (last.epoch, last.before.boot):
                 return Pair(last, shot) if shot.stream == "tactile" else Pair(shot, last)
             last = shot
-        raise EOFError(f"{self.folder} has no further pair of images: call connect() to start again, or use loop=True.")
+        raise EOFError(f"{self.folder} has no further pair of images: call connect() to start again.")
 
     def __enter__(self) -> "Replay":
         return self if self._shots is not None else self.connect()
@@ -214,34 +207,22 @@ class Replay:
     def _play(self, start_s: float) -> Iterator[Shot]:
         """The images, from a time on the clock `time.monotonic` (s)."""
         speed, first_s = self._speed or 1.0, self._stills[0].time_s
-        steps = [b.time_s - a.time_s for a, b in itertools.pairwise(self._stills) if b.time_s > a.time_s]
-        lap_s = self._stills[-1].time_s - first_s + (statistics.median(steps) if steps else 0.0)
-        epochs = 1 + self._stills[-1].epoch - self._stills[0].epoch
-        for lap in itertools.count() if self._loop else range(1):
-            frames = {stream: _frames(self.folder / f"{stream}.mkv") for stream in ("visual", "tactile")}
-            for still in self._stills:
-                frame = next(frames[still.stream])
-                due_s = start_s + (lap * lap_s + still.time_s - first_s) / speed
-                if self._speed is not None:
-                    if time.monotonic() > due_s + _LATE_S:
-                        self.skipped += 1
-                        continue
-                    time.sleep(max(due_s - time.monotonic(), 0.0))
-                image = frame.to_ndarray(format="rgb24")
-                image.flags.writeable = False
-                before, shift_s = still.before, due_s - still.time_s / speed
-                yield dataclasses.replace(
-                    still,
-                    image=image,
-                    time_s=due_s,
-                    epoch=still.epoch + lap * epochs,
-                    before=dataclasses.replace(
-                        before,
-                        sent_s=before.sent_s / speed + shift_s,
-                        acknowledged_s=before.acknowledged_s / speed + shift_s,
-                    ),
-                    until_s=still.until_s / speed + shift_s,
-                )
+        frames = {stream: _frames(self.folder / f"{stream}.mkv") for stream in ("visual", "tactile")}
+        for still in self._stills:
+            frame = next(frames[still.stream])
+            due_s = start_s + (still.time_s - first_s) / speed
+            if self._speed is not None:
+                if time.monotonic() > due_s + _LATE_S:
+                    self.skipped += 1
+                    continue
+                time.sleep(max(due_s - time.monotonic(), 0.0))
+            image = frame.to_ndarray(format="rgb24")
+            image.flags.writeable = False
+            before, shift_s = still.before, due_s - still.time_s / speed
+            sent_s, acknowledged_s = (time_s / speed + shift_s for time_s in (before.sent_s, before.acknowledged_s))
+            before = dataclasses.replace(before, sent_s=sent_s, acknowledged_s=acknowledged_s)
+            until_s = still.until_s / speed + shift_s
+            yield dataclasses.replace(still, image=image, time_s=due_s, before=before, until_s=until_s)
 
 
 def _recorded(folder: Path) -> list[Shot]:

@@ -56,16 +56,6 @@ class Device:
         object.__setattr__(self, "camera", public(self.camera))
 
     @property
-    def width(self) -> int:
-        """Width of the raw images (pixels)."""
-        return self.lens.width
-
-    @property
-    def height(self) -> int:
-        """Height of the raw images (pixels)."""
-        return self.lens.height
-
-    @property
     def exposures(self) -> tuple[float, float] | None:
         """Exposures of the visual and the tactile stream in the driver's unit, or None if one is not set."""
         if self.exposure_visual is None or self.exposure_tactile is None:
@@ -77,7 +67,7 @@ class Device:
 
         `source` is another path or URL of the same camera, such as its URL with a password.
         """
-        config = CameraConfig(self.camera if source is None else source, self.width, self.height, fps=self.fps)
+        config = CameraConfig(source or self.camera, self.lens.width, self.lens.height, fps=self.fps)
         if config.kind != "device":
             return dataclasses.replace(config, lock=False)
         return dataclasses.replace(
@@ -95,20 +85,19 @@ class Device:
             sensor: Constants of the simulated sensor, whose `camera` describes the rectified view.
             backgrounds: Images of the empty pad without and with light. None: those in the folder stay.
         """
-        file = sensor_file(path)
-        content = dataclasses.asdict(self)
+        file, shape, content = sensor_file(path), (self.lens.height, self.lens.width, 3), dataclasses.asdict(self)
         storage.decode(Device, content, "device")
         manifest = storage.read_manifest(file.parent, _AGAIN) if backgrounds is None else None
         files = {} if manifest is None else manifest.files
         for name, image in zip(BACKGROUNDS, backgrounds or (), strict=False):
-            if image.shape != (self.height, self.width, 3):
-                raise ValueError(f"a background has shape {image.shape}, but the lens {(self.height, self.width, 3)}")
+            if image.shape != shape:
+                raise ValueError(f"a background has shape {image.shape}, but the lens {shape}")
             buffer = io.BytesIO()
             Image.fromarray(image).save(buffer, "PNG", compress_level=3)
             storage.write_bytes(file.with_name(name), buffer.getvalue())
-            files[name] = storage.sha256(file.with_name(name))
+            files |= storage.checksums(file.parent, [name])
         storage.write_json(file, {**sensor.constants(), "device": content})
-        storage.write_manifest(file.parent, {**files, file.name: storage.sha256(file)})
+        storage.write_manifest(file.parent, files | storage.checksums(file.parent, [file.name]))
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> "Device":
@@ -133,15 +122,11 @@ class Device:
 
     def check_identity(self, *, camera: str | None = None, leds: str | None = None) -> None:
         """Raise a ValueError if the given camera (path or URL) or controller (serial number) is another one."""
-        different = []
-        if camera is not None and public(camera) != self.camera:
-            different.append(f"camera {public(camera)}")
-        if leds is not None and leds != self.leds:
-            different.append(f"LED controller {leds}")
-        if different:
+        camera, leds = self.camera if camera is None else public(camera), leds or self.leds
+        if (camera, leds) != (self.camera, self.leds):
             raise ValueError(
                 f"the sensor file describes camera {self.camera} and LED controller {self.leds}, but the connected "
-                f"sensor has {' and '.join(different)}: load its own sensor file, or make one with "
+                f"sensor has camera {camera} and LED controller {leds}: load its own sensor file, or make one with "
                 "`python -m experiments.commission`."
             )
 

@@ -27,20 +27,21 @@ from jaxtyping import Int, UInt8
 
 from sts_jax import storage
 from sts_jax.hardware import protocol
-from sts_jax.hardware.guide import End
 from sts_jax.hardware.leds import Lit
 from sts_jax.hardware.proof import Pair, Shot, Stream
 from sts_jax.hardware.sts import STS
 from sts_jax.storage import MANIFEST, DamagedFileError
 
 _TRAJECTORIES, _DISCARDED = "trajectories", "discarded"
-_ENDS: tuple[End, End] = ("initial", "final")
 _STREAMS: tuple[Stream, Stream] = ("visual", "tactile")
 # Filters and Huffman codes only, because full deflate is slower and does not make noisy images smaller.
 _PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY)
 
+End = Literal["initial", "final"]  # "initial": the pair of the held object, "final": the pair of the object at rest
 Standing = Literal["confirmed", "unconfirmed", "incomplete", "discarded"]
 Image = UInt8[np.ndarray, "height width 3"]
+
+_ENDS: tuple[End, End] = ("initial", "final")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,26 +71,26 @@ def _name(source: str) -> str:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class RecordedTrajectory:
-    """A confirmed trajectory: the raw images at its beginning and at its end."""
+    """A confirmed trajectory: its number, the raw images of the held object and of the object at rest, and the note."""
 
-    number: int  # number of the trajectory in its session
-    initial: Pair  # images of the held object
-    final: Pair  # images of the object at rest
-    note: str  # text that was stored with the confirmation, may be empty
+    number: int
+    initial: Pair
+    final: Pair
+    note: str
 
 
 class RecordedImages(NamedTuple):
-    """Initial and final images of n recorded trajectories."""
+    """RGB images of n recorded trajectories, with the axis (initial, final), and the trajectories' numbers."""
 
-    visual: UInt8[np.ndarray, "n 2 height width 3"]  # visual images, RGB. The second axis is initial, final
-    tactile: UInt8[np.ndarray, "n 2 height width 3"]  # tactile images, RGB. The second axis is initial, final
-    number: Int[np.ndarray, "n"]  # number of each trajectory in its session
+    visual: UInt8[np.ndarray, "n 2 height width 3"]
+    tactile: UInt8[np.ndarray, "n 2 height width 3"]
+    number: Int[np.ndarray, "n"]
 
 
 class Entry(NamedTuple):
     """A trajectory in the result of `list_recordings`."""
 
-    number: int  # number of the trajectory in its session
+    number: int
     standing: Standing  # "unconfirmed": both pairs exist. "incomplete": a pair is missing
     taken: str | None  # date and time of the initial visual image, ISO 8601, UTC. None: there is none
     note: str  # text that was stored with the confirmation, may be empty
@@ -103,10 +104,7 @@ class Session:
     """
 
     def __init__(self, folder: str | os.PathLike, origin: Origin | None = None):
-        """Start a new session, or continue one of the same sensor. The folder is locked until `close`.
-
-        Without an `origin`, the session must exist already.
-        """
+        """Start a session, or continue one, which must exist without an `origin`. It is locked until `close`."""
         self.folder = Path(folder)
         if origin is None:
             _read_origin(self.folder)
@@ -230,14 +228,12 @@ def _numbered(folder: Path) -> Iterator[tuple[str, int, Path]]:
 
 def _move(source: Path, target: Path) -> None:
     if not source.is_dir():
-        raise FileNotFoundError(
-            f"trajectory folder {source} does not exist: list the trajectories with list_recordings()."
-        )
+        raise FileNotFoundError(f"{source} does not exist: list the trajectories with list_recordings().")
     if target.exists():
         raise FileExistsError(f"{source} cannot be moved to {target}, which exists already: remove one of the two.")
     source.rename(target)
-    for path in (target.parent, source.parent):
-        storage.flush_folder(path)
+    storage.flush_folder(target.parent)
+    storage.flush_folder(source.parent)
 
 
 def _remedy(number: int) -> str:
@@ -278,8 +274,7 @@ def load_recordings(folder: str | os.PathLike) -> "Recordings":
 class Recordings:
     """The confirmed trajectories of a session, as a sequence of `RecordedTrajectory`, from `load_recordings`.
 
-    Each access to a trajectory reads its files and compares their checksums. The numbers are read once, so later
-    changes of the session do not change them.
+    Each access to a trajectory reads its files and compares their checksums. The numbers are read once.
     """
 
     def __init__(self, folder: str | os.PathLike):
@@ -323,8 +318,7 @@ class Recordings:
         """Read the images of all trajectories into arrays. 500 trajectories of 1640 x 1232 pixels need 12 GB.
 
         Args:
-            convert: Function that is applied to each raw image, for example `rectified` with the lens of the sensor.
-                All results must have the same shape.
+            convert: Function that is applied to each raw image, such as `rectified` with the lens of the sensor.
             progress: Called after each trajectory with the numbers of trajectories done so far and in all.
         """
         if not self.numbers:

@@ -1,4 +1,4 @@
-"""`Twin`: a simulated sensor, whose LED controller and camera share one clock, and the log of its frames."""
+"""`Twin`, a simulated sensor whose LED controller and camera share one clock, its log, and `VirtualSensor`."""
 
 import contextlib
 import dataclasses
@@ -17,14 +17,22 @@ from jaxtyping import UInt8
 
 from sts_jax import storage
 from sts_jax.hardware import protocol
+from sts_jax.hardware.camera import Captured
 from sts_jax.hardware.emulation import EmulatedController
 from sts_jax.hardware.leds import Lit
 from sts_jax.hardware.lens import Lens
+from sts_jax.hardware.proof import Pair, ProvenFrames, Settling
+from sts_jax.hardware.session import Origin
+from sts_jax.hardware.sts import checked_levels
 from sts_jax.hardware.twin import photometry
 from sts_jax.hardware.twin.scene import Scene, Seen
 
-ANSWER_S = 0.004  # duration of a request on the virtual clock (s). Its levels apply after half of this time
+CAMERA = "twin"  # name of the camera in sessions and sensor files
+_ANSWER_S = 0.004  # duration of a request on the virtual clock (s). Its levels apply after half of this time
 _TICK_S = 0.005  # period with which the watchdog is checked on the virtual clock (s)
+_SWITCHES = 8  # number of switches in each direction from which the settling times are measured
+_WATCH_S = 1.0  # time after the first switch in each direction during which frames are watched (s)
+_TIMEOUT_S = 10.0  # longest wait for a pair (s)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,17 +53,17 @@ class Exposure(Seen):
 
 @dataclasses.dataclass(frozen=True)
 class State(Seen):
-    """The scene and the lights at one time."""
+    """The scene and the lights at one time, on the twin's clock."""
 
-    now_s: float  # time on the twin's clock (s)
+    now_s: float
     levels: protocol.Levels  # duty cycles of the four LED channels, 0 to 255
 
 
 class TwinFrame(NamedTuple):
-    """One frame of the camera."""
+    """One frame of the camera: its ground truth, and the image as a client receives it."""
 
-    exposure: Exposure  # ground truth
-    jpeg: bytes  # image, as a client receives it
+    exposure: Exposure
+    jpeg: bytes
 
 
 class Twin:
@@ -63,15 +71,7 @@ class Twin:
 
     A new twin runs on a virtual clock. Only `step`, `capture`, `set` and `ping` advance this clock, so the same calls
     with the same seeds return the same frames. `Served` runs a twin on the real clock instead, behind a serial port and
-    a camera stream.
-
-    ```python
-    body = sts_jax.objects.make(jax.random.key(0), "bottle")
-    with Twin(ObjectScene(body)) as twin:
-        twin.command("hold")  # place the bottle on the pad
-        twin.set((255, 255, 255, 255))  # turn all lights on
-        truth, image = twin.capture()  # ground truth and image of the next frame
-    ```
+    a camera stream. `docs/hardware/twin.md` has examples.
     """
 
     def __init__(
@@ -138,14 +138,9 @@ class Twin:
         self._boot(clock())
 
     def command(self, command: str) -> State:
-        """Move the object in the scene. On the real clock, the images that are needed are rendered first.
+        """Move the object by a command of the scene, and return the state after it.
 
-        Args:
-            command: `hold` holds the object on the pad in the first pose of the next trajectory, `release` lets it go,
-                and `clear` takes it away.
-
-        Returns:
-            The state after the command.
+        On the real clock, the images that are needed are rendered first.
         """
         with self._commands:
             if self._clock is not None:
@@ -155,7 +150,7 @@ class Twin:
         return self.state
 
     def receive(self, data: bytes = b"") -> bytes:
-        """Pass bytes from the host to the LED controller and run its watchdog. Returns the bytes that it sends back."""
+        """Pass bytes from the host to the LED controller, with its watchdog. Returns the bytes that it sends back."""
         with self._lock:
             now = self.now_s
             sent = self._controller.receive(data, now)
@@ -167,29 +162,15 @@ class Twin:
         return self._epoch_s + self.imperfections.exposure_s + index / self.rate
 
     def make(self, index: int) -> TwinFrame:
-        """Produce a frame after the end of its exposure, and write it to the files `log` and `record`.
-
-        Args:
-            index: Number of the frame, which must increase from call to call, in one thread.
-        """
-        constants = self.imperfections
-        end = self.end_s(index)
+        """Produce a frame after the end of its exposure, and log it. `index` increases from call to call."""
+        constants, end = self.imperfections, self.end_s(index)
         start = end - constants.exposure_s
         with self._lock:
             light = self._lights.over(start, end)
             seen = self.scene.at((start + end) / 2)
         self._due_s = max(self._due_s, end + constants.lag_s + self._random.uniform(0, constants.jitter_s))
-        exposure = Exposure(
-            **vars(seen),
-            index=index,
-            start_s=start,
-            end_s=end,
-            due_s=self._due_s,
-            light=light.mean,
-            lowest=light.lowest,
-            highest=light.highest,
-        )
-        image = self.blender.frame(self.scene.ends(seen, self.blender), light.mean)
+        exposure = Exposure(**vars(seen), index=index, start_s=start, end_s=end, due_s=self._due_s, **light._asdict())
+        image = self.blender.frame(self.scene.ends(seen, self.blender), light.light)
         jpeg = photometry.encode(image, constants.jpeg_quality)
         if self._record is not None:
             self._record.write(jpeg)
@@ -218,12 +199,12 @@ class Twin:
         return exposure, photometry.decode(jpeg)
 
     def set(self, levels: Sequence[int]) -> Lit:
-        """Set the four levels (0 to 255), and advance the virtual clock by `ANSWER_S`. Returns the applied levels."""
+        """Set the four levels (0 to 255), and advance the virtual clock by 4 ms. Returns the applied levels."""
         first, second, third, fourth = levels
         return self._request(protocol.Set(next(self._sequence), (first, second, third, fourth)))
 
     def ping(self) -> Lit:
-        """Ask for the levels, which keeps the lights on for another 1 s, and advance the clock by `ANSWER_S`."""
+        """Ask for the levels, which keeps the lights on for another 1 s, and advance the clock by 4 ms."""
         return self._request(protocol.Ping(next(self._sequence)))
 
     def close(self) -> None:
@@ -237,19 +218,65 @@ class Twin:
         self.close()
 
     def _boot(self, now_s: float) -> None:
-        """Start the controller, the lights and the camera at a time (s)."""
         self._epoch_s = now_s  # begin of the camera's first exposure
         self._controller = EmulatedController(now_s=now_s, serial_number=self.serial_number)
         self._lights = photometry.LightHistory(self.imperfections.rise_s)
 
     def _request(self, request: protocol.Set | protocol.Ping) -> Lit:
-        """Pass a request to the controller, which executes it after half of `ANSWER_S`."""
+        """Pass a request to the controller, which executes it after half of 4 ms."""
         sent_s = self.now_s
-        self.step(ANSWER_S / 2)
+        self.step(_ANSWER_S / 2)
         lines = self.receive(protocol.encode_request(request)).splitlines(keepends=True)
-        self.step(ANSWER_S / 2)
+        self.step(_ANSWER_S / 2)
         reply = next(reply for reply in map(protocol.decode_reply, lines) if isinstance(reply, protocol.State))
         return Lit(reply.levels, reply.counter, reply.boot, sent_s, self.now_s)
+
+
+class _Devices:
+    """Camera, LED controller and clock of a twin as `ProvenFrames` uses them."""
+
+    source = CAMERA
+
+    def __init__(self, twin: Twin):
+        self._twin = twin
+        self.set, self.ping, self.sleep = twin.set, twin.ping, twin.step
+
+    def async_read(self, timeout_ms: float | None = None) -> Captured:
+        del timeout_ms  # a virtual frame always arrives
+        exposure, image = self._twin.capture()
+        image.flags.writeable = False
+        time_s = self._twin.now_s
+        self.ping()  # keeps the lights on, as the thread of `hardware.Leds` does
+        return Captured(image, time_s, exposure.index)
+
+    def monotonic(self) -> float:
+        return self._twin.now_s
+
+    def reconnect(self, *, limit_s: float) -> None:
+        raise AssertionError("a virtual controller is never lost")
+
+
+class VirtualSensor:
+    """Reads pairs from a `Twin` on its virtual clock. `hardware.collect` accepts it in place of `hardware.STS`.
+
+    The proof of light is that of `STS`. Attributes: `settling`, and `origin` for `hardware.Session`.
+    """
+
+    def __init__(self, twin: Twin, *, levels: Sequence[int] = (255, 255, 255, 255), settling: Settling | None = None):
+        """Connect to a twin. Without `settling`, the settling times are measured. The scene must then be at rest."""
+        self._twin, devices = twin, _Devices(twin)
+        limits = {"timeout_s": _TIMEOUT_S, "reconnect_s": _TIMEOUT_S}
+        levels = checked_levels(levels)
+        self._frames = ProvenFrames(devices, devices, levels=levels, exposures=None, clock=devices, **limits)
+        height, width, _ = twin.capture()[1].shape
+        self.origin = Origin(CAMERA, twin.serial_number, width, height, levels)
+        if settling is not None:
+            self._frames.see_both(settling)
+        self.settling = self._frames.measure_settling(_SWITCHES, _WATCH_S) if settling is None else settling
+
+    def read(self) -> Pair:
+        """Take a visual and a tactile image, whose frames arrive after the start of this call."""
+        return self._frames.pair(self._twin.now_s + _TIMEOUT_S)
 
 
 def read_log(path: str | os.PathLike) -> list[Exposure]:

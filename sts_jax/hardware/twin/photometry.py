@@ -28,11 +28,11 @@ _MOST_SAMPLES = 3  # largest number of samples per raw pixel along each axis
 
 
 class Light(NamedTuple):
-    """The brightness of the LEDs during an interval, as a share of their full power, 0 to 1."""
+    """The mean, smallest and largest brightness of the LEDs in an interval, as shares of their full power, 0 to 1."""
 
-    mean: float  # mean share
-    lowest: float  # smallest share
-    highest: float  # largest share
+    light: float
+    lowest: float
+    highest: float
 
 
 class _Change(NamedTuple):
@@ -47,9 +47,7 @@ class LightHistory:
     """The brightness of the LEDs over time, as a share of their full power. Not thread-safe.
 
     After a change of the levels at t0, the share approaches the mean of the four levels, a:
-
-        s(t) = a + (s0 - a) exp(-(t - t0) / tau)
-
+    s(t) = a + (s0 - a) exp(-(t - t0) / tau).
     The LEDs are dimmed by pulses at 31 kHz, far shorter than an exposure, so only the mean of the pulses matters.
     """
 
@@ -84,7 +82,6 @@ class LightHistory:
         return Light(min(max(integral / (end_s - start_s), lowest), highest), lowest, highest)
 
     def _share(self, change: _Change, time_s: float) -> float:
-        """The share of the full power at a time after a change and before the next one."""
         if change.share == change.target or time_s - change.time_s >= _RISEN * self._rise_s:
             return change.target
         return change.target + (change.share - change.target) * math.exp((change.time_s - time_s) / self._rise_s)
@@ -134,13 +131,9 @@ class Blender:
     def __init__(
         self, imperfections: Imperfections, *, sensor: Sensor | None = None, lens: Lens | None = None, seed: int = 0
     ):
-        """Prepare the lookup tables.
+        """Prepare the lookup tables. Without a lens, the frames are rectified.
 
-        Args:
-            imperfections: Deviations of the camera.
-            sensor: Exposure and view of the scene's images. Default: `Sensor()`.
-            lens: Fisheye lens, whose raw images the frames are. Default: the frames are rectified.
-            seed: Seed of the noise.
+        `sensor` has the exposure and the view of the scene's images. Default: `Sensor()`.
         """
         sensor = Sensor() if sensor is None else sensor
         self._imperfections, self._lens, self._pinhole = imperfections, lens, sensor.camera

@@ -49,10 +49,7 @@ class Seen:
 
 
 class Scene(abc.ABC):
-    """Base class of scenes. A subclass defines `at` and `ends`, and `command` if its scene takes commands.
-
-    `Twin` never calls `at` and `command` at the same time. The commands are `hold`, `release` and `clear`.
-    """
+    """Base class of scenes. `Twin` never calls `at` and `command` at the same time."""
 
     sensor: Sensor | None = None  # exposure and view of the images. None: `Sensor()`
 
@@ -77,8 +74,7 @@ class Picture(Scene):
 
     def __init__(self, visual: np.ndarray, tactile: np.ndarray):
         """Store the images, in [0, 1], shape (height, width, 3)."""
-        self._images = np.asarray(visual), np.asarray(tactile)
-        self._ends = functools.cache(lambda blender: blender.ends(*self._images))
+        self._ends = functools.cache(lambda blender: blender.ends(np.asarray(visual), np.asarray(tactile)))
 
     def at(self, time_s: float) -> Seen:
         """Return the only state."""
@@ -133,13 +129,10 @@ class ObjectScene(Scene):
         """Prepare the scene. The simulation starts when a trajectory is needed.
 
         Args:
-            body: Object on the pad.
-            sensor: Constants of the sensor. Default: `Sensor()`.
             scenario: Scenario of the trajectories. Default: `physics.Released()`.
             resolution: (height, width) of the rendered view (pixels).
             motion_rate: Rendered poses per second of a moving object. Default: 10 for views of up to 640 x 480 pixels,
                 and proportionally fewer for larger views, but at least 1.
-            seed: Seed of the trajectories.
             first: Number of the first trajectory, to continue an earlier scene of the same seed.
         """
         if motion_rate is None:
@@ -190,18 +183,12 @@ class ObjectScene(Scene):
     def command(self, command: str, time_s: float) -> None:
         """Hold, release or remove the object from a time on (s)."""
         _, _, number = self._events[-1]
-        phase = self.at(time_s).phase
-        match command:
-            case "hold":
-                self._events.append((time_s, Phase.HELD, number + 1))
-            case "release" if phase is Phase.HELD:
-                self._events.append((time_s, Phase.MOVING, number))
-            case "clear":
-                self._events.append((time_s, Phase.EMPTY, number))
-            case "release":
-                raise ValueError(f"command is 'release', but the phase is '{phase}': send 'hold' first")
-            case _:
-                raise ValueError(f"command must be 'hold', 'release' or 'clear', got {command!r}")
+        after = {"hold": (Phase.HELD, number + 1), "release": (Phase.MOVING, number), "clear": (Phase.EMPTY, number)}
+        if command not in after:
+            raise ValueError(f"command must be 'hold', 'release' or 'clear', got {command!r}")
+        if command == "release" and (phase := self.at(time_s).phase) is not Phase.HELD:
+            raise ValueError(f"command is 'release', but the phase is '{phase}': send 'hold' first")
+        self._events.append((time_s, *after[command]))
         del self._events[:-_EVENTS]
         for key in [key for key in self._rendered if 0 <= key[0] < self._events[-1][2] - 1]:
             del self._rendered[key]
@@ -225,10 +212,8 @@ class ObjectScene(Scene):
         key = jax.random.fold_in(self._key, self._batches)
         self._batches += 1
         batch = physics.simulate(key, self._body, self.sensor, self.scenario, num=_BATCH)
-        poses, wrenches = np.asarray(batch.pose), np.asarray(batch.wrench)
-        return [
-            _Motion(poses[i], wrenches[i], self.scenario.rate, _rest(poses[i])) for i in np.flatnonzero(batch.settled)
-        ]
+        settled = [(np.asarray(batch.pose[i]), np.asarray(batch.wrench[i])) for i in np.flatnonzero(batch.settled)]
+        return [_Motion(pose, wrench, self.scenario.rate, _rest(pose)) for pose, wrench in settled]
 
     def _render(self, trajectory: int, frame: int, blender: Blender) -> Ends:
         """The images of one pose without light and at full light, rendered or from the cache."""
@@ -241,9 +226,8 @@ class ObjectScene(Scene):
         with self._working:
             ends = self._rendered.get((trajectory, frame))  # another thread may have rendered it meanwhile
             if ends is None:
-                images = sense(
-                    self.sensor, self._body, jnp.asarray(pose), jnp.asarray(wrench), resolution=self._resolution
-                )
+                state = jnp.asarray(pose), jnp.asarray(wrench)
+                images = sense(self.sensor, self._body, *state, resolution=self._resolution)
                 ends = blender.ends(np.asarray(images.visual), np.asarray(images.tactile))
                 self._rendered[trajectory, frame] = ends
             return ends

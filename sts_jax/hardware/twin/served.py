@@ -4,12 +4,12 @@ import contextlib
 import dataclasses
 import json
 import os
+import queue
 import select
 import socket
 import threading
 import time
 import tty
-from collections import deque
 from pathlib import Path
 
 from sts_jax.hardware import web
@@ -20,13 +20,13 @@ COMMANDS = ("hold", "release", "clear")
 _WAIT_S = 0.1  # longest time until waiting threads notice that they must stop (s)
 _TICK_S = 0.003  # longest wait for bytes, after which the watchdog is checked (s)
 _BUFFER = 1 << 16  # size of a connection's send buffer (bytes). With a larger one, a slow client gets older frames
-_KEPT = 32  # largest number of frames that wait for their delivery
+_KEPT = 32  # largest number of frames that wait for their delivery to a client
 
 
 class _LedPort:
     """A pseudo-terminal that acts as the serial port of the twin's LED controller. It has any baud rate."""
 
-    def __init__(self, twin: Twin, link: str | os.PathLike | None = None):
+    def __init__(self, twin: Twin, link: str | os.PathLike | None):
         self._twin = twin
         self._link = None if link is None else Path(link)
         if self._link is not None and self._link.exists() and not self._link.is_symlink():
@@ -62,58 +62,30 @@ class _LedPort:
             os.close(descriptor)
 
 
-class _Camera:
-    """Produces the frames of a twin while at least one client is connected."""
+class _Server(web.Server):
+    """The HTTP server, and the camera, which produces frames while at least one client is connected."""
 
-    def __init__(self, twin: Twin, stop: threading.Event):
+    def __init__(self, host: str, port: int, twin: Twin, stop: threading.Event):
         self.twin, self.stop = twin, stop
-        self._frames: deque[TwinFrame] = deque(maxlen=_KEPT)
-        self._changed = threading.Condition()
-        self._clients = 0
+        self.clients: set[queue.Queue[TwinFrame]] = set()  # the frames that wait for their delivery to each client
+        super().__init__(host, port, _Handler)
 
-    def add_clients(self, number: int) -> None:
-        """Count connected clients, with -1 for one that has gone."""
-        with self._changed:
-            self._clients += number
-            self._changed.notify_all()
-
-    def following(self, index: int) -> TwinFrame | None:
-        """Return the newest frame after a number that is due, or else the first one that will be due.
-
-        If there is none yet, the method waits for at most 0.1 s and may return None.
-        """
-        with self._changed:
-            later = [frame for frame in self._frames if frame.exposure.index > index]
-            if not later:
-                self._changed.wait(_WAIT_S)
-                later = [frame for frame in self._frames if frame.exposure.index > index]
-        now = self.twin.now_s
-        due = [frame for frame in later if frame.exposure.due_s <= now]
-        return due[-1] if due else later[0] if later else None
-
-    def run(self) -> None:
+    def produce(self) -> None:
         """Produce frames until the event `stop` is set."""
         twin, index = self.twin, -1
         while not self.stop.is_set():
-            with self._changed:
-                if not self._clients:
-                    self._changed.wait(_WAIT_S)
-                    continue
+            if not self.clients:
+                self.stop.wait(_TICK_S)
+                continue
             # If this thread is late, it skips frames, as a real camera does.
             index = max(index + 1, int((twin.now_s - twin.end_s(0)) * twin.rate))
             while (wait_s := twin.end_s(index) - twin.now_s) > 0:
                 if self.stop.wait(wait_s):
                     return
             frame = twin.make(index)
-            with self._changed:
-                self._frames.append(frame)
-                self._changed.notify_all()
-
-
-class _Server(web.Server):
-    def __init__(self, host: str, port: int, camera: _Camera):
-        self.camera = camera
-        super().__init__(host, port, _Handler)
+            for client in list(self.clients):
+                with contextlib.suppress(queue.Full):  # the client reads too slowly
+                    client.put_nowait(frame)
 
 
 class _Handler(web.Handler):
@@ -123,7 +95,7 @@ class _Handler(web.Handler):
         if self.path == CAMERA:
             self._stream()
         elif self.path == "/state":
-            self._json(200, dataclasses.asdict(self.server.camera.twin.state))
+            self._json(200, dataclasses.asdict(self.server.twin.state))
         else:
             self._unknown()
 
@@ -133,7 +105,7 @@ class _Handler(web.Handler):
             self._unknown()
             return
         try:
-            self._json(200, dataclasses.asdict(self.server.camera.twin.command(command)))
+            self._json(200, dataclasses.asdict(self.server.twin.command(command)))
         except ValueError as error:
             self._json(400, {"error": str(error)})
 
@@ -146,19 +118,20 @@ class _Handler(web.Handler):
 
     def _stream(self) -> None:
         """Send each frame when it is due. A client that reads too slowly misses frames."""
-        camera, index = self.server.camera, -1
+        server, frames = self.server, queue.Queue[TwinFrame](_KEPT)
         self.request.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
-        camera.add_clients(1)
+        server.clients.add(frames)
         try:
             self.begin_stream()
-            while not camera.stop.is_set():
-                frame = camera.following(index)
-                if frame is not None:
-                    time.sleep(max(0.0, frame.exposure.due_s - camera.twin.now_s))
-                    self.send_frame(frame.jpeg)
-                    index = frame.exposure.index
+            while not server.stop.is_set():
+                with contextlib.suppress(queue.Empty):
+                    exposure, jpeg = frames.get(timeout=_WAIT_S)
+                    late_s = server.twin.now_s - exposure.due_s
+                    if late_s < 1 / server.twin.rate or frames.empty():
+                        time.sleep(max(0.0, -late_s))
+                        self.send_frame(jpeg)
         finally:
-            camera.add_clients(-1)
+            server.clients.discard(frames)
 
 
 class Served:
@@ -187,18 +160,18 @@ class Served:
         """
         twin.run_on(time.monotonic)
         self._stop = threading.Event()
-        camera = _Camera(twin, self._stop)
-        with contextlib.ExitStack() as opened:
-            self._web = _Server(host, http_port, camera)
-            opened.callback(self._web.server_close)
+        self._web = _Server(host, http_port, twin, self._stop)
+        try:
             self._leds = _LedPort(twin, link)
-            opened.pop_all()
+        except OSError:
+            self._web.server_close()
+            raise
         self.port = self._leds.device  # name of the serial port of the LED controller
         self.url = self._web.url  # URL of the HTTP server, such as `http://127.0.0.1:45253`
         self.camera = self.url + CAMERA  # URL of the camera stream, for `cv2.VideoCapture`
         self._threads = [
             threading.Thread(target=self._web.serve_forever, args=(0.05,), name="twin's HTTP server", daemon=True),
-            threading.Thread(target=camera.run, name="twin's camera", daemon=True),
+            threading.Thread(target=self._web.produce, name="twin's camera", daemon=True),
             threading.Thread(target=self._leds.serve, args=(self._stop,), name="twin's LED port", daemon=True),
         ]
         for thread in self._threads:
@@ -206,7 +179,7 @@ class Served:
 
     @property
     def description(self) -> str:
-        """A text of five lines: the serial port, the URLs of the server, and whether other machines can connect."""
+        """The serial port, the URLs of the server, and whether other machines can connect, in five lines."""
         reach = (
             f"{self._web.host} is the loopback interface: only this machine can connect."
             if self._web.is_local
