@@ -122,7 +122,7 @@ def images(config: Config, source: Source) -> Generator[hardware.Shot, None, Non
             stack.callback(recorder.close)
         if isinstance(sensor, hardware.Replay):
             laps = itertools.count() if config.loop else range(1)
-            shots = itertools.chain.from_iterable(sensor.connect().stream() for _ in laps)
+            shots: Iterator[hardware.Shot] = itertools.chain.from_iterable(sensor.connect().stream() for _ in laps)
         else:
             shots = sensor.stream(dwell=config.dwell)
         for shot in shots:

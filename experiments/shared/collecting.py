@@ -266,8 +266,8 @@ def commissioned(config: Collect, device: twin.Twin) -> tuple[twin.VirtualSensor
         there.check_identity(camera=twin.CAMERA, leds=device.serial_number)
         if (there.lens.width, there.lens.height) != config.size:
             raise ValueError(
-                f"{file} is for images of {there.lens.width} x {there.lens.height} pixels, but --size is {config.size}: "
-                "change it, or choose another --workdir"
+                f"{file} is for images of {there.lens.width} x {there.lens.height} pixels, but --size is "
+                f"{config.size}: change it, or choose another --workdir"
             )
         settling = hardware.Settling(there.settle_off_s, there.settle_on_s)
     sensor = twin.VirtualSensor(device, levels=LEVELS, settling=settling)
