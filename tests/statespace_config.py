@@ -1,6 +1,7 @@
 """The smallest models, which compile in seconds, random inputs for them, and a kill of a training."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -92,6 +93,7 @@ def random_densities(rng, number, components=1, angle=0.0):
     return networks.FinalPose(**{name: jnp.asarray(x, jnp.float32) for name, x in numbers.items()})
 
 
+@functools.cache
 def untrained(config, **view):
     """A predictor with an untrained model for images of 32x32 pixels."""
     kind = {statespace.Config: statespace, mvae.Config: mvae}[type(config)]

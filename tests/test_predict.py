@@ -29,15 +29,19 @@ SMALL = mvae.Config(MODALITIES, latent=8, hidden=16, widths=(4, 4, 4, 4))
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def predictor(tmp_path_factory):
     path = tmp_path_factory.mktemp("mvae") / "saved"
     untrained(SMALL).save(path)
-    return path
+    return sts.Predictor.load(path)
 
 
 @pytest.fixture(scope="module")
-def predictor(folder):
-    return sts.Predictor.load(folder)
+def state_predictor(tmp_path_factory):
+    path = tmp_path_factory.mktemp("statespace") / "saved"
+    state_model().save(path)
+    numbers = statespace.Calibration(*(jnp.full(8, x) for x in (0.8, 0.9, 1.5, 30.0)))
+    training.save_calibration(path, numbers, STATE.inputs)
+    return sts.Predictor.load(path)
 
 
 def measurement(*lead, seed=0):
@@ -142,17 +146,29 @@ def test_a_condition_is_given_in_si_units():
     assert np.isnan(traced(CONDITION * np.array([[1], [1e3]])).pose).all(-1).tolist() == [False, True]
 
 
-def test_only_state_space_models_are_calibrated(folder):
+def test_only_state_space_models_are_calibrated(predictor):
     with pytest.raises(ValueError, match="mvae model"):
-        training.calibrate(folder, training.Arrays({}, {}))
+        training.calibrate(predictor.name, training.Arrays({}, {}))
 
 
-def test_a_model_without_preprocessing_is_named(folder, monkeypatch):
-    model = training.load(folder)
-    settings = {**model.settings, "preprocessing": {}}
+@pytest.mark.parametrize(
+    ("kind", "change", "message"),
+    [
+        ("predictor", None, r"config\.json is not valid: .* training\.train\(.*, preprocessing="),
+        ("state_predictor", {"resolution": [16, 16]}, "was trained with resolution=.*, but its networks need"),
+        ("state_predictor", {"crop": True}, "was trained with crop="),
+        ("state_predictor", {"rotation": "quaternion"}, "was trained with rotation="),
+        ("state_predictor", {"position_scale": 0.1}, "was trained with position_scale="),
+    ],
+)
+def test_a_model_without_its_preprocessing_is_refused(kind, change, message, request, monkeypatch):
+    path = request.getfixturevalue(kind).name
+    model = training.load(path)
+    preprocessing = {} if change is None else model.settings["preprocessing"] | change
+    settings = model.settings | {"preprocessing": preprocessing}
     monkeypatch.setattr(training, "load", lambda _: model._replace(settings=settings))
-    with pytest.raises(ValueError, match=r"config\.json is not valid: .* training\.train\(.*, preprocessing="):
-        sts.Predictor.load(folder)
+    with pytest.raises(ValueError, match=message):
+        sts.Predictor.load(path)
 
 
 @pytest.mark.parametrize("kind", ["predictor", "state_predictor"])
@@ -223,15 +239,6 @@ def test_only_an_invalid_traced_item_gives_nan(predictor, name, change):
         predictor(**wrong)
 
 
-@pytest.fixture(scope="module")
-def state_predictor(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("statespace") / "saved"
-    state_model().save(folder)
-    numbers = statespace.Calibration(*(jnp.full(8, x) for x in (0.8, 0.9, 1.5, 30.0)))
-    training.save_calibration(folder, numbers, STATE.inputs)
-    return sts.Predictor.load(folder)
-
-
 def test_a_state_space_model_predicts_samples_and_outcomes(state_predictor):
     given = measurement(2)
     given["visual"][1, 4:12, 6:20] = 0.1
@@ -288,15 +295,6 @@ def test_a_state_space_model_works_in_jit_vmap_and_grad(state_predictor):
     slope = jax.grad(lambda pose: run(pose, CONDITION).pose[:, 0].sum())(jnp.asarray(pose))
     finite(slope)
     assert np.abs(slope).max() > 0
-
-
-@pytest.mark.parametrize(
-    "change", [{"resolution": (16, 16)}, {"crop": True}, {"rotation": "quaternion"}, {"position_scale": 0.1}]
-)
-def test_a_state_space_model_of_another_view_is_refused(tmp_path, change):
-    state_model(**change).save(tmp_path / "model")
-    with pytest.raises(ValueError, match=f"was trained with {next(iter(change))}=.*, but its networks need"):
-        sts.Predictor.load(tmp_path / "model")
 
 
 def test_a_model_of_the_library_is_loaded_by_its_name(state_predictor, predictor, tmp_path, monkeypatch):
