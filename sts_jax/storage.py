@@ -29,7 +29,7 @@ class LockedError(RuntimeError):
     """A folder is already locked, by another process or by this one."""
 
 
-def write_whole(path: Path, write: Callable[[Path], None]) -> None:
+def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     """Write a file atomically. An interruption leaves either the complete new file or the previous state.
 
     Missing folders are created. An OSError names the file and the remedy. Other errors of `write` are raised unchanged.
@@ -73,11 +73,7 @@ def remedy(error: Exception) -> str:
 
 def write_bytes(path: Path, data: bytes) -> None:
     """Write bytes to a file atomically."""
-
-    def write(temporary: Path) -> None:
-        temporary.write_bytes(data)
-
-    write_whole(path, write)
+    write_whole(path, lambda temporary: temporary.write_bytes(data))
 
 
 def write_json(path: Path, content: Any) -> None:

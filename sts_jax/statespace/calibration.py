@@ -12,7 +12,6 @@ images. The gradient energy is the sum of the squared differences of neighbourin
 """
 
 import functools
-import itertools
 import math
 from collections.abc import Iterable, Iterator
 from typing import Any
@@ -63,17 +62,16 @@ def fit(
         `CONTRAST`.
     """
     names = nnx.merge(graphdef, params).config.inputs
-    number = len(targets["pose"])
-    masks = {name: np.ones(number, bool) for name in names} | (present or {})
+    masks = {name: np.ones(len(targets["pose"]), bool) for name in names} | (present or {})
     fitted = np.ones((2 ** len(names), 4))
     fitted[:, 3] = CONTRAST
-    for members in itertools.product((False, True), repeat=len(names)):
-        chosen = [name for name, member in zip(names, members, strict=True) if member]
-        rows = np.flatnonzero(np.all([masks[name] for name in chosen], axis=0)) if chosen else np.zeros(0, int)
+    for number in range(1, 2 ** len(names)):
+        chosen = [name for i, name in enumerate(names) if number & 2**i]
+        rows = np.flatnonzero(np.all([masks[name] for name in chosen], axis=0))
         if len(rows):
             final = _densities(graphdef, params, _chunks(inputs, empty, condition, chosen, rows), len(rows))
             truth = (jnp.asarray(targets[name][rows]) for name in ("state", "pose", "outcome"))
-            numbers = fitted[sum(2 ** names.index(name) for name in chosen)]
+            numbers = fitted[number]
             numbers[:3] = _fitted(final, *truth)
             some = rows[np.linspace(0, len(rows), min(len(rows), _MOST), endpoint=False).astype(int)]
             chunks = _chunks(inputs, empty, condition, chosen, some)

@@ -34,9 +34,7 @@ class State(NamedTuple):
     com: Float[Array, "n 3"]  # centre of mass in the mesh frame, in units of 0.01 m
     mass: Float[Array, "n 1"]  # natural logarithm of the mass in units of 0.05 kg
     support_in_sensor: Float[Array, "n k"]  # coefficients of the support function, for directions in the sensor frame
-    com_in_sensor: Float[
-        Array, "n 3"
-    ]  # vector from mesh origin to centre of mass in the sensor frame, in units of 0.01 m
+    com_in_sensor: Float[Array, "n 3"]  # from mesh origin to centre of mass in the sensor frame, in units of 0.01 m
 
 
 @functools.cache
