@@ -12,7 +12,6 @@ from sts_jax import evaluation, statespace, storage, training
 from sts_jax.statespace import calibration, objective, predict
 
 NUMBER = 40
-SUBSETS = ((), ("visual",), ("tactile",), ("visual", "tactile"), ("pose",), ("visual", "pose"), ("tactile", "pose"))
 NUMBERS = statespace.Calibration(*(jnp.asarray(np.linspace(low, 2, 8), jnp.float32) for low in (0.5, 0.7, 0.9, 1.1)))
 
 
@@ -73,21 +72,18 @@ def test_fitted_power_recovers_the_power_of_drawn_outcomes(true):
 @pytest.mark.slow
 def test_each_item_is_corrected_by_the_numbers_of_its_inputs():
     """Items whose masks differ give the same density as if each were alone."""
-    given, number = arrays(), len(SUBSETS)
-    graphdef, params, _ = statespace.init(jax.random.key(0), STATE)
-    inputs = {name: jnp.asarray(calibration._unit(x[:number])) for name, x in given.inputs.items()}
-    empty = {name: jnp.asarray(calibration._unit(image)) for name, image in given.empty.items()}
-    condition = jnp.asarray(given.condition[:number])
-    present = {name: jnp.array([name in subset for subset in SUBSETS]) for name in STATE.inputs}
+    given = jax.tree.map(jnp.asarray, trajectories(8))
+    model = statespace.init(jax.random.key(0), STATE)[:2]
+    present = {name: jnp.arange(8) // 2**i % 2 == 1 for i, name in enumerate(STATE.inputs)}
 
     @jax.jit
-    def run(present, correction):
-        return predict.predict(nnx.merge(graphdef, params), inputs, present, empty, condition, correction)[1]
+    def run(correction):
+        parts = given["inputs"], present, given["empty"], given["condition"], correction
+        return predict.predict(nnx.merge(*model), *parts)[1]
 
-    plain, found = run(present, None), run(present, NUMBERS)
-    for i, subset in enumerate(SUBSETS):
-        number = sum(2 ** STATE.inputs.index(name) for name in subset)
-        expected = predict.corrected(plain, *(x[number] for x in NUMBERS[:3]))
+    plain, found = run(None), run(NUMBERS)
+    for i in range(8):
+        expected = predict.corrected(plain, *(x[i] for x in NUMBERS[:3]))
         for a, b in zip(found, expected, strict=True):
             np.testing.assert_allclose(a[i], b[i], rtol=1e-5, atol=1e-5)
 
