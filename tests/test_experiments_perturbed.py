@@ -2,18 +2,20 @@
 
 import dataclasses
 import json
+import shutil
 import types
 
 import numpy as np
 import pytest
+from damage import damaged
 from PIL import Image
 
 import sts_jax as sts
 from benchmarks import deterministic, scaling
 from benchmarks.instruments.experiments import EXPERIMENTS
 from experiments import perturbed, show
-from experiments.shared import run
-from sts_jax import dataset, evaluation, physics
+from experiments.shared import evaluate, run
+from sts_jax import dataset, evaluation, physics, storage, training
 
 pytestmark = pytest.mark.slow
 
@@ -40,6 +42,55 @@ def workdir(tmp_path_factory):
     workdir = tmp_path_factory.mktemp("runs") / "perturbed"
     run.main(TINY, workdir)
     return workdir
+
+
+# Files whose content nothing depends on.
+UNREAD = {
+    ".lock": "an empty file, which the system locks",
+    "objects.txt": "a listing of objects for people",
+}
+
+
+def complaints(workdir, top, inputs):
+    """What the readers of a part of a work directory say, with the settings and the checksums of the undamaged run."""
+    try:
+        if top == "config.json":
+            run.claim(TINY, workdir)
+        elif top == "dataset":
+            data = dataset.load(workdir / "dataset")
+            data.pairs(data.rendered(), symmetries=True)
+            data.views("train")
+        elif top == "models":
+            sts.Predictor.load(workdir / "models/statespace")
+            training.records(workdir / "models/statespace")
+        else:
+            return [reason for part in inputs if (reason := evaluate.stale(workdir, part, inputs[part]))]
+    except (OSError, ValueError) as error:
+        return [str(error)]
+    return []
+
+
+def test_damage_of_any_file_of_a_work_directory_is_named_or_the_file_is_made_again(workdir, tmp_path):
+    copy = shutil.copytree(workdir, tmp_path / "copy")
+    inputs = {part: fact["inputs"] for part, fact in storage.read_manifest(copy, "").facts.items()}
+    assert set(inputs) == {"evaluation by object", "ceiling by object"}
+    paths = [path for path in sorted(copy.rglob("*")) if path.is_file() and path.name not in UNREAD]
+    assert len(paths) > 30
+    assert not any(complaints(copy, top, inputs) for top in ("config.json", "dataset", "models", "metrics.json"))
+    unnoticed, unnamed = [], []
+    for number, path in enumerate(paths):
+        content, place = path.read_bytes(), path.relative_to(copy)
+        alike = [other for other in paths[number + 1 :] + paths[:number] if other.suffix == path.suffix]
+        alike.sort(key=lambda other: other.name != path.name)
+        other = next((other for other in alike if other.read_bytes() != content), None)
+        for kind in damaged(path, other, flips=1):
+            said = complaints(copy, place.parts[0], inputs)
+            if not said and not (path.exists() and path.read_bytes() == content):
+                unnoticed.append((str(place), kind))
+            elif said and not any(path.name in text for text in said):
+                unnamed.append((str(place), kind, said))
+    assert not unnoticed
+    assert not unnamed
 
 
 def test_the_model_predicts_from_every_subset_of_its_inputs(workdir):
