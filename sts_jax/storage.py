@@ -225,11 +225,12 @@ def write_manifest(folder: Path, files: Mapping[str, str], facts: Mapping[str, A
     return Manifest(**content)
 
 
-def read_manifest(folder: Path, remedy: str) -> Manifest | None:
+def read_manifest(folder: Path, remedy: str, *facts: str) -> Manifest | None:
     """Read `manifest.json`, without comparing the files. None if the folder has no such file.
 
     Args:
-        remedy: Text at the end of the error message, with the remedy for a damaged or edited manifest.
+        remedy: Text at the end of the error message, with the remedy for a damaged, edited or exchanged manifest.
+        facts: Names of facts that every folder of this kind has.
     """
     path = folder / MANIFEST
     if not path.exists():
@@ -238,6 +239,8 @@ def read_manifest(folder: Path, remedy: str) -> Manifest | None:
     known = isinstance(content, dict) and content.keys() == {"files", "facts", "checksum"}
     if not known or content.pop("checksum") != digest(content):
         raise DamagedFileError(f"{path} is damaged, or was written by another version of sts_jax: {remedy}.")
+    if missing := set(facts) - content["facts"].keys():
+        raise DamagedFileError(f"{path} is that of another folder (it has no {', '.join(sorted(missing))}): {remedy}.")
     return Manifest(**content)
 
 

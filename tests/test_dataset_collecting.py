@@ -204,7 +204,7 @@ EDITED = r" is not the file that manifest\.json lists .*delete it \(of a shard b
         (edit("manifest.json", "facts", {"shards": 1}), r"manifest\.json is damaged"),
         (lambda at: (at / "manifest.json").unlink(), r"manifest\.json is missing, but .* has shards: restore it, or"),
         (rewrite("collection.json", lambda data: b"\xff"), r"collection\.json cannot be read as JSON"),
-        (of_format(4), r"is a dataset of format 4, .* reads format 6: collect into another"),
+        (of_format(4), r"collection\.json is of a dataset of format 4, .* reads format 6: collect into another"),
     ],
 )
 def test_damage_is_named_and_nothing_is_overwritten(copied, damage, message):

@@ -267,7 +267,7 @@ def load(folder: str | Path) -> Dataset:
     if folder.is_file():
         raise NotADirectoryError(f"{folder} is a file: give the folder of a collected dataset.")
     manifest = records.manifest_of(folder)
-    if manifest is None or "shards" not in manifest.facts:
+    if manifest is None:
         raise FileNotFoundError(f"{folder} is not a collected dataset: give another folder, or call `collect`.")
     count = manifest.facts["shards"]
     files = [records.shard_files(index, count) for index in range(count)]

@@ -53,10 +53,10 @@ def manifest_of(folder: Path) -> Manifest | None:
         written = content.get("format", 1) if isinstance(content, dict) else None  # the first format had no number
         if written != FORMAT:
             raise ValueError(
-                f"{folder} is a dataset of format {written!r}, but this version of sts_jax reads format {FORMAT}: "
+                f"{path} is of a dataset of format {written!r}, but this version of sts_jax reads format {FORMAT}: "
                 "collect into another folder, or read this one with the version that wrote it."
             )
-    manifest = read_manifest(folder, f"restore it, or collect into another folder than {folder}")
+    manifest = read_manifest(folder, f"restore it, or collect into another folder than {folder}", "shards")
     if manifest is None and any(folder.glob("shard-*")):
         raise DamagedFileError(
             f"{folder / MANIFEST} is missing, but {folder} has shards: restore it, or collect into another folder."

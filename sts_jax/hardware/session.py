@@ -250,9 +250,9 @@ def list_recordings(folder: str | os.PathLike) -> list[Entry]:
 def _entry(path: Path, number: int, *, discarded: bool) -> Entry:
     taken, note = None, ""
     with contextlib.suppress(OSError):  # reading the trajectory later raises an error that names a damaged file
-        if (initial := storage.read_manifest(path / "initial", "")) is not None:
+        if (initial := storage.read_manifest(path / "initial", "", "visual")) is not None:
             taken = initial.facts["visual"]["taken"]
-        if (confirmation := storage.read_manifest(path, "")) is not None:
+        if (confirmation := storage.read_manifest(path, "", "note")) is not None:
             note = confirmation.facts["note"]
     standing: Standing = "discarded"
     if not discarded:

@@ -77,7 +77,7 @@ class Model(NamedTuple):
 
 def manifest(folder: Path) -> storage.Manifest | None:
     """Read the manifest of a model's folder. None before the first checkpoint."""
-    listed = storage.read_manifest(folder, _remedy(folder))
+    listed = storage.read_manifest(folder, _remedy(folder), "step")
     if listed is None and any((folder / "checkpoints").glob("[0-9]*")):
         raise storage.DamagedFileError(f"{folder} has a checkpoint but no {storage.MANIFEST}: {_remedy(folder)}.")
     return listed
