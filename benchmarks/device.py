@@ -20,20 +20,25 @@ import multiprocessing.connection
 import os
 import tempfile
 import time
+import zlib
 from pathlib import Path
 from typing import NamedTuple
 
 import tyro
 
-from benchmarks.instruments import peers, twin_peer
-from benchmarks.instruments.peers import Shown
+from benchmarks.instruments import peers
+from benchmarks.instruments.peers import Image, SensorPeer, Shown
+from experiments.shared.device import TwinConfig, make_twin
 from sts_jax import hardware, storage
+from sts_jax.hardware import twin as twins
+from sts_jax.hardware.twin import photometry
 
 SIZE = (640, 480)
 FPS = 60.0
 EXPOSURE_S = 0.016
 MOVE, FINISHED = "move", "finished"  # requests to the process of the emulated devices
 EVERY = 10  # pairs between two movements of the twin's object
+JPEG_START = b"\xff\xd8\xff"  # first bytes of a JPEG image
 LEAST = 0.8  # least required rate, as a share of the camera's limit
 
 
@@ -74,13 +79,48 @@ class Measured(NamedTuple):
         return 1 / (2 / FPS + (self.settling.visual_s + self.settling.tactile_s) / 2)
 
 
+class TwinPeer:
+    """A digital twin with a camera at the address `url` and an LED controller at a serial port."""
+
+    def __init__(self, path: Path, *, fps: float, lag_s: float, exposure_s: float, size: tuple[int, int]) -> None:
+        """Render the first images, and start the camera and the controller."""
+        self._log, self._record = path.with_suffix(".jsonl"), path.with_suffix(".mjpeg")
+        imperfections = twins.Imperfections(exposure_s=exposure_s, lag_s=lag_s)
+        self.twin = make_twin(
+            TwinConfig(size[::-1], rate=fps, imperfections=imperfections, log=self._log, record=self._record)
+        )
+        self._served = twins.Served(self.twin, link=path)
+        self.url = self._served.camera
+
+    def move(self) -> None:
+        """Release the object if it is held. Otherwise, hold it in its next pose."""
+        self.twin.command("release" if self.twin.state.phase == twins.Phase.HELD else "hold")
+
+    def stop(self) -> None:
+        """Stop the twin, its camera and its LED controller."""
+        self._served.close()
+        self.twin.close()
+
+    def shown(self) -> dict[int, Shown]:
+        """Read the frame numbers and the brightness of the LEDs from the twin's log."""
+        _, *parts = self._record.read_bytes().split(JPEG_START)
+        images = (photometry.decode(JPEG_START + part) for part in parts)
+        frames = zip(images, twins.read_log(self._log), strict=True)
+        return {self.key(image): Shown(frame.index, frame.light) for image, frame in frames}
+
+    @staticmethod
+    def key(image: Image) -> int:
+        """Compute the checksum of an image's pixels. Frames differ in their noise, so their checksums differ too."""
+        return zlib.crc32(image.tobytes())
+
+
 def serve(link: multiprocessing.connection.Connection, path: Path, lag_s: float, twin: bool) -> None:
     """Run the emulated devices in a process of their own, until the process that reads the images has finished."""
-    make: type[twin_peer.TwinPeer | peers.SensorPeer] = twin_peer.TwinPeer if twin else peers.SensorPeer
+    make: type[TwinPeer | SensorPeer] = TwinPeer if twin else SensorPeer
     peer = make(path, fps=FPS, lag_s=lag_s, exposure_s=EXPOSURE_S, size=SIZE)
     link.send(peer.url)
     while link.recv() == MOVE:
-        if isinstance(peer, twin_peer.TwinPeer):
+        if isinstance(peer, TwinPeer):
             peer.move()
     peer.stop()
     link.send(peer.shown())
@@ -93,7 +133,7 @@ def measure(lag_ms: float, pairs: int, path: Path, *, twin: bool) -> Measured:
     process = context.Process(target=serve, args=(there, path, lag_ms / 1000, twin), daemon=True)
     process.start()
     url = here.recv()
-    key = twin_peer.key if twin else peers.key
+    key = TwinPeer.key if twin else peers.key
     taken: list[tuple[int, float]] = []  # key of each image, and the share of light that it must have
     sequences: list[int] = []
     camera = hardware.CameraConfig(url, *SIZE, lock=False, buffer=8)

@@ -121,11 +121,10 @@ def gains(study: Study, items: list[objects.Body], starts: Starts, read: np.ndar
     print(f"{'gain: ' + study.noise_name:30s} {interval(classifier.gain, before, after)}", flush=True)
     if read is None:
         return
-    with_read = losses(study, items, starts, read)
     error = np.sqrt(np.nanmean((read - exact) ** 2, 0))
     print(f"{'read in the tactile frame':30s} rms error {' '.join(f'{e:.4g}' for e in error)}")
-    print(f"{'gain: pictures':30s} {interval(classifier.gain, before, with_read)}")
-    print(f"{'share of the gain kept':30s} {interval(classifier.kept, before, after, with_read)}", flush=True)
+    gain = interval(classifier.gain, before, losses(study, items, starts, read))
+    print(f"{'gain: pictures':30s} {gain}", flush=True)
 
 
 def pictures(study: Study, items: list[objects.Body], starts: Starts, others: int, steps: int) -> np.ndarray:

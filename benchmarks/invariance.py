@@ -28,7 +28,7 @@ import dataclasses
 import math
 import os
 from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -61,20 +61,14 @@ class Args:
     only: Literal["box", "bottle", "jerked-bottles"] | None = None  # the only case to compute (default: all)
 
 
-class MirroredFreefall(physics.Freefall):
-    """The scenario `Freefall` with mirrored starts, for objects from `objects.mirror`."""
+def mirrored(scenario: Any) -> Any:
+    """Make the same scenario with mirrored starts, for objects from `objects.mirror`."""
 
-    def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-        """Sample a start for the unmirrored shape, and reflect it."""
-        return mirror(super().start(key, mirror_shape(shape), pad))
+    class Mirrored(type(scenario)):  # type: ignore[misc]
+        def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
+            return mirror(super().start(key, mirror_shape(shape), pad))
 
-
-class MirroredPerturbed(physics.Perturbed):
-    """The scenario `Perturbed` with mirrored starts, for objects from `objects.mirror`."""
-
-    def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-        """Sample a start for the unmirrored shape, and reflect it."""
-        return mirror(super().start(key, mirror_shape(shape), pad))
+    return Mirrored(**{field.name: getattr(scenario, field.name) for field in dataclasses.fields(scenario)})
 
 
 def mirror(start: Start) -> Start:
@@ -139,12 +133,11 @@ def cases() -> list[Case]:
     bottles = [objects.make(jax.random.key(i), "bottle") for i in range(4)]
     squat = objects.make(jax.random.key(27), "bottle")  # 101 mm high, 44 mm wide
     small, middle, large = (f"on {1e3 * a:.0f} x {1e3 * b:.0f} mm" for a, b in ((BOX[1], BOX[2]), BOX[::2], BOX[:2]))
-    mirrored = MirroredFreefall(**dataclasses.asdict(DROP) | {"contact": DROP.contact})
-    shaken = MirroredPerturbed(**dataclasses.asdict(SHAKE) | {"contact": SHAKE.contact})
+    dropped, shaken = mirrored(DROP), mirrored(SHAKE)
     outcomes = tuple(outcome.name.lower() for outcome in physics.Outcome)
     return [
-        Case("box", DROP, mirrored, [box()], (small, middle, large, "on no face", "fell off"), box_face),
-        Case("bottle", DROP, mirrored, [squat], ("stands", "on its head", "lies", "fell off"), bottle_side),
+        Case("box", DROP, dropped, [box()], (small, middle, large, "on no face", "fell off"), box_face),
+        Case("bottle", DROP, dropped, [squat], ("stands", "on its head", "lies", "fell off"), bottle_side),
         Case("jerked-bottles", SHAKE, shaken, bottles, outcomes, SHAKE.outcome),
     ]
 

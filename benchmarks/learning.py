@@ -54,18 +54,10 @@ def plain_conv_transpose(x: Array, kernel: Array, stride: int, padding: int) -> 
     return jax.lax.conv_transpose(x, kernel[::-1, ::-1], (stride, stride), pads, dimension_numbers=LAYOUT)
 
 
-def stepper(model: mvae.Config, size: int, absent: tuple[str, ...]) -> Callable[[], None]:
-    """Make a function that runs one compiled training step of an `mvae` model on random data."""
-    rng = np.random.default_rng(0)
-    data: dict[str, Any] = {
-        m.name: rng.integers(0, 256, (size, *m.shape), dtype=np.uint8)
-        if m.kind == "image"
-        else rng.random((size, *m.shape), np.float32)
-        for m in model.modalities
-    }
-    masks = {"tactile": np.zeros(size, bool)} if "tactile" in data and not absent else {}
-    inputs = {name: x for name, x in data.items() if name not in absent}
-    batch = training.Arrays(inputs, data, masks).take(np.arange(size))
+def stepper(
+    model: mvae.Config | statespace.Config, batch: training.Arrays, size: int, absent: tuple[str, ...] = ()
+) -> Callable[[], None]:
+    """Make a function that runs one compiled training step of a model."""
     config = training.TrainConfig(batch_size=size)
     learner = training.learner(model, absent=absent)
     graphdef, state = training.initial(config, learner, 100)
@@ -79,6 +71,20 @@ def stepper(model: mvae.Config, size: int, absent: tuple[str, ...]) -> Callable[
     return call
 
 
+def paper_stepper(model: mvae.Config, size: int, absent: tuple[str, ...]) -> Callable[[], None]:
+    """Make a function that runs one training step of an `mvae` model on random data."""
+    rng = np.random.default_rng(0)
+    data: dict[str, Any] = {
+        m.name: rng.integers(0, 256, (size, *m.shape), dtype=np.uint8)
+        if m.kind == "image"
+        else rng.random((size, *m.shape), np.float32)
+        for m in model.modalities
+    }
+    masks = {"tactile": np.zeros(size, bool)} if "tactile" in data and not absent else {}
+    inputs = {name: x for name, x in data.items() if name not in absent}
+    return stepper(model, training.Arrays(inputs, data, masks).take(np.arange(size)), size, absent)
+
+
 def predictor(size: int) -> Callable[[], None]:
     """Make a function that predicts all modalities of `MODEL` from a fixed batch of visual images."""
     graphdef, params, stats = mvae.init(jax.random.key(0), MODEL)
@@ -89,7 +95,7 @@ def predictor(size: int) -> Callable[[], None]:
 
 
 def state_stepper(size: int) -> Callable[[], None]:
-    """Make a function that runs one compiled training step of a state-space model on random data."""
+    """Make a function that runs one training step of a state-space model on random data."""
     rng, model = np.random.default_rng(0), statespace.Config()
     config = training.TrainConfig(batch_size=size)
 
@@ -113,15 +119,7 @@ def state_stepper(size: int) -> Callable[[], None]:
         falls=ends(config.falls),
     )
     batch = arrays.take(np.arange(size), views=np.arange(config.views), falls=np.arange(config.falls))
-    learner = training.learner(model)
-    graphdef, state = training.initial(config, learner, 100)
-    run = jax.jit(lambda s, b: training.step(learner, graphdef, config, 100, s, b), donate_argnums=0)
-
-    def call() -> None:
-        nonlocal state
-        state, _ = jax.block_until_ready(run(state, batch))
-
-    return call
+    return stepper(model, batch, size)
 
 
 def state_predictor(num_samples: int) -> Callable[[], None]:
@@ -140,13 +138,13 @@ def state_predictor(num_samples: int) -> Callable[[], None]:
 def paper() -> None:
     """Print how long training steps and a prediction take with the paper's model (ms)."""
     with mock.patch.multiple(networks, conv=plain_conv, conv_transpose=plain_conv_transpose):
-        plain = stepper(MODEL, 64, ())
-    ours, enumerated = median_seconds(stepper(MODEL, 64, ("tactile",)), plain, repeats=3)
+        plain = paper_stepper(MODEL, 64, ())
+    ours, enumerated = median_seconds(paper_stepper(MODEL, 64, ("tactile",)), plain, repeats=3)
     ratio = enumerated / ours
     print(f"training step, batch 64: {1e3 * ours:.1f} ms, plain {1e3 * enumerated:.1f} ms, ratio {ratio:.1f}")
     for size in (16, 32):
-        show(f"training step, batch {size}", stepper(MODEL, size, ("tactile",)), 5)
-    show("training step, visual only, batch 64", stepper(VISUAL, 64, ()), 5)
+        show(f"training step, batch {size}", paper_stepper(MODEL, size, ("tactile",)), 5)
+    show("training step, visual only, batch 64", paper_stepper(VISUAL, 64, ()), 5)
     show("prediction, batch 1", predictor(1), 50)
 
 

@@ -36,7 +36,7 @@ import mujoco.rollout
 import numpy as np
 import tyro
 
-from benchmarks.instruments.starts import bodies, rigid_of
+from benchmarks.instruments.starts import SCENARIOS, bodies, rigid_of
 from benchmarks.instruments.timing import fresh, in_turn
 from experiments.shared import drawing
 from sts_jax import dataset, objects, physics
@@ -54,11 +54,7 @@ from sts_jax.physics.simulation import draw as draw_starts
 from sts_jax.sensor import Sensor
 
 RESULTS = Path(__file__).parent / "results" / "physics"
-SCENARIOS: dict[str, physics.Scenario] = {
-    "freefall": physics.Freefall(),
-    "perturbed": physics.Perturbed(),
-    "inclined": physics.Inclined(),
-}
+COMPILED = ("freefall", "perturbed", "inclined")  # scenarios whose compilation is measured
 OBJECTS = 100  # objects whose compilations are counted
 GPU_BATCH = 4096  # frames rendered at once on a GPU
 TACCEL = 915  # environment steps/s of the simulator Taccel, published for 4,096 environments on an H100
@@ -307,7 +303,7 @@ def first_call(name: str, count: int) -> dict[str, Any]:
 
 def compilation() -> None:
     """Print the seconds of compilation of each scenario, with an empty and with a filled compilation cache."""
-    for name in SCENARIOS:
+    for name in COMPILED:
         with tempfile.TemporaryDirectory() as folder:
             for kind in ("empty cache", "kept cache"):
                 found = fresh("benchmarks.physics.first_call", name, OBJECTS, cache=Path(folder))

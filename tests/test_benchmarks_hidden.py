@@ -30,9 +30,6 @@ def test_gain_of_a_known_channel_and_folds_by_object():
     gain = classifier.interval(classifier.gain, before, after, groups=body)
     assert gain.low < 1 - entropy / math.log(2) < gain.high
     assert gain.high - gain.low < 0.1
-    weight = np.ones(len(body))
-    assert classifier.kept(before, after, before, weight) == pytest.approx(0, abs=1e-6)
-    assert classifier.kept(before, after, after, weight) == pytest.approx(1)
 
     # The identity determines a coin that is thrown once for each object, but only for objects of the training folds.
     coin = rng.integers(0, 2, 60)[body]

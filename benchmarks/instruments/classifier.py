@@ -60,11 +60,6 @@ def gain(before: np.ndarray, after: np.ndarray, weight: np.ndarray) -> float:
     return 1 - mean(after, weight) / mean(before, weight)
 
 
-def kept(before: np.ndarray, after: np.ndarray, other: np.ndarray, weight: np.ndarray) -> float:
-    """Ratio of the gains of two classifiers, `gain(before, other, weight) / gain(before, after, weight)`."""
-    return gain(before, other, weight) / gain(before, after, weight)
-
-
 def interval(statistic: Callable[..., float], *columns: np.ndarray, groups: np.ndarray) -> Interval:
     """Compute a statistic and its 95 % interval, from a bootstrap that resamples groups of rows."""
     draws = metrics.bootstrap(groups, lambda weight: np.asarray(statistic(*columns, weight)))

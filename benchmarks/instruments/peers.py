@@ -8,7 +8,6 @@ so a benchmark can check the light of an image independently of `hardware.STS`.
 import contextlib
 import dataclasses
 import functools
-import http.server
 import os
 import select
 import threading
@@ -22,7 +21,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from sts_jax.hardware import protocol
+from sts_jax.hardware import protocol, web
 from sts_jax.hardware.emulation import EmulatedController
 
 SIZE = (160, 120)  # pixels, width and height
@@ -93,16 +92,12 @@ class MotionJpeg:
         """Listen for requests. If the server was stopped before, it listens at its previous port again."""
         server = self
 
-        class Handler(http.server.BaseHTTPRequestHandler):
-            def log_message(self, *args: object) -> None:
-                pass
-
+        class Handler(web.Handler):
             def do_GET(self) -> None:
-                with contextlib.suppress(OSError):
-                    server.answer(self)
+                server.answer(self)
 
         self.running = True
-        self.http = http.server.ThreadingHTTPServer(("127.0.0.1", self.port), Handler)
+        self.http = web.Server("127.0.0.1", self.port, Handler)
         self.port = self.http.server_port
         self.thread = threading.Thread(target=self.http.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
         self.thread.start()
@@ -114,7 +109,7 @@ class MotionJpeg:
         self.http.server_close()
         self.thread.join()
 
-    def answer(self, request: http.server.BaseHTTPRequestHandler) -> None:
+    def answer(self, request: web.Handler) -> None:
         """Answer a request for the stream in the way that the attribute `mode` selects."""
         if self.mode == "hang":
             self._pause("hang")
@@ -122,15 +117,12 @@ class MotionJpeg:
         if self.mode == "missing":
             request.send_error(404)
             return
-        request.send_response(200)
-        kind = "text/html" if self.mode == "text" else "multipart/x-mixed-replace; boundary=frame"
-        request.send_header("Content-Type", kind)
-        request.end_headers()
         if self.mode == "text":
-            request.wfile.write(b"<html>no video</html>")
+            request.send("text/html", b"<html>no video</html>")
             return
+        request.begin_stream()
         due = time.monotonic()
-        held = b""
+        held: list[bytes] = []
         while self.running and self.mode != "close":
             if self.mode == "stall":
                 self._pause("stall")
@@ -144,11 +136,11 @@ class MotionJpeg:
             if self.mode != "repeat" or not self._last:
                 self._last = self._frame()
             self.served.setdefault(self.number, time.monotonic())
-            head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(self._last)}\r\n\r\n".encode()
-            held += head + self._last + b"\r\n"
+            held.append(self._last)
             if self.mode != "held":
-                request.wfile.write(held)
-                held = b""
+                for frame in held:
+                    request.send_frame(frame)
+                held = []
 
     def _pause(self, mode: str) -> None:
         while self.running and self.mode == mode:
@@ -364,8 +356,7 @@ class SeenLights(MotionJpeg):
             image[:CORNER, :CORNER] = 0.3 * draw(self.number, (CORNER, CORNER)) + 110
         if self.moving:
             cv2.circle(image, (20 + 7 * self.number % 100, height // 2), 16, (0, 0, 0), -1)
-        spot = self.spot
-        if spot is not None:
+        if (spot := self.spot) is not None:
             cv2.circle(image, spot[:2], spot[2], (30, 30, 30), -1)
         if not self.numbered:
             noise = np.random.default_rng(self.number).normal(0, 1, image.shape)
@@ -376,7 +367,7 @@ class SeenLights(MotionJpeg):
         """Look up an image's exposure by the frame number in its corner."""
         if image.shape[1::-1] != self.size or image.max() < DARK / 2:
             return None
-        return self.log.get(number_of(image[:CORNER, :CORNER]))
+        return self.log.get(key(image))
 
 
 class SensorPeer:
