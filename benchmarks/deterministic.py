@@ -35,7 +35,7 @@ TITLE = "deterministic network, from all inputs"
 class Args:
     """Options of the command line."""
 
-    workdir: Annotated[run.Folder, tyro.conf.Positional]  # work directory of an experiment
+    workdir: Annotated[Path, tyro.conf.Positional]  # work directory of an experiment
     scenario: Literal["freefall", "inclined", "perturbed"] = "freefall"  # scenario of the work directory
     preset: Literal["smoke", "default", "long"] = "default"  # preset of the work directory
     seconds: float = 420.0  # duration of the training after compilation (s)
@@ -145,7 +145,8 @@ def main(args: Args) -> str:
     sts.enable_compilation_cache()
     config, sensor = EXPERIMENTS[args.scenario].PRESETS[args.preset], sts.Sensor()
     with storage.lock(args.workdir):
-        data = run.collect(config, args.workdir, sensor)
+        storage.claim(args.workdir / "config.json", dataclasses.asdict(config))
+        data = run.collect(config.collection, sensor, args.workdir / "dataset")
     rows, scenario = evaluation.rows_of(data, config.splits[0]), config.collection.scenario
     train, given = data.pairs(rows["train"]), data.pairs(rows["test"])
     job = next(run.jobs(config, sensor, train))

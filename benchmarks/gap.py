@@ -25,7 +25,6 @@ import tyro
 import sts_jax as sts
 from experiments.shared import drawing, terminal
 from experiments.shared.device import FIELD_OF_VIEW, TwinConfig, make_twin
-from experiments.shared.run import Folder
 from experiments.shared.terminal import Bar
 from sts_jax import hardware, storage
 from sts_jax.evaluation import gap
@@ -46,7 +45,7 @@ CLEAN = twin.Imperfections(leakage=0.0, vignetting=0.0, read_noise=0.0, full_wel
 class Args:
     """Options of the command line."""
 
-    workdir: Folder = Path("runs/gap-twin")  # folder for both sessions and the sensor file
+    workdir: Path = Path("runs/gap-twin")  # folder for both sessions and the sensor file
     trajectories: int = 40  # number of trajectories in each session
     resolution: tuple[int, int] = (240, 320)  # height and width at which images are compared (pixels)
     seed: int = 0  # seed of the object, the trajectories and the noise

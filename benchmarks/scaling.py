@@ -35,7 +35,7 @@ SUBSETS = (("visual", "pose"), ("visual",))
 class Args:
     """Options of the command line."""
 
-    workdir: Annotated[run.Folder, tyro.conf.Positional]  # work directory of an experiment
+    workdir: Annotated[Path, tyro.conf.Positional]  # work directory of an experiment
     scenario: Literal["freefall", "inclined", "perturbed"] = "freefall"  # scenario of the work directory
     preset: Literal["smoke", "default", "long"] = "default"  # preset of the work directory
     # shares of the training objects. A model of each share is trained for the largest number of `steps`
@@ -115,7 +115,8 @@ def main(args: Args) -> str:
     sts.enable_compilation_cache()
     config = EXPERIMENTS[args.scenario].PRESETS[args.preset]
     with storage.lock(args.workdir):
-        data = run.collect(config, args.workdir, sts.Sensor())
+        storage.claim(args.workdir / "config.json", dataclasses.asdict(config))
+        data = run.collect(config.collection, sts.Sensor(), args.workdir / "dataset")
         sizes = dict.fromkeys([(share, max(args.steps)) for share in args.shares] + [(1.0, n) for n in args.steps])
         given = data.pairs(data.members("test"))
         test, scenario = dataset.reduced(given, config.image_size), config.collection.scenario

@@ -28,7 +28,8 @@ import tyro
 from matplotlib.figure import Figure
 
 import sts_jax as sts
-from experiments.shared import drawing, laying
+from experiments import sense
+from experiments.shared import drawing
 from experiments.shared.terminal import on_one_line
 from sts_jax import tactile
 
@@ -40,13 +41,10 @@ SETTLED = (1e-5, 1e-5, 1e-3)  # step in x (m), y (m) and yaw (rad) below which t
 OFF = (0.003, 10.0)  # error of the initial pose of a fit: distance (m) and yaw (degrees)
 GOAL = (0.0002, 1.0)  # largest error of a successful fit: distance (m) and yaw (degrees)
 SEEN = 0.02  # smallest change of a pixel's value by touch that counts as an imprint
-# A turn of 10 degrees and a shift by 3 mm both change the image. If the turn changes it by less than this share of the
-# change by the shift, the object is nearly round, and its yaw cannot be determined.
-FAINT = 0.25
 
 
 @dataclasses.dataclass(frozen=True)
-class Config(laying.Config):
+class Config(sense.Placed):
     """Options of the command line: the object, its true pose, and the number of fits."""
 
     mesh: Annotated[str, tyro.conf.Positional]  # path of a mesh file, or name of an object class
@@ -55,11 +53,6 @@ class Config(laying.Config):
     position: tuple[float, float] = (0.0073, -0.0041)  # true x and y of the centre of the object's bounding box (m)
     turn: float = 23.7  # true turn of the object about the vertical axis (degrees)
     starts: int = 10  # number of fits, each from another initial pose
-
-    # A fit does not use these options of `laying.Config`.
-    crop: Annotated[bool, tyro.conf.Suppress] = False
-    light: Annotated[float, tyro.conf.Suppress] = 1.0
-    height: Annotated[float, tyro.conf.Suppress] = 0.0
 
 
 class Slope(NamedTuple):
@@ -162,48 +155,40 @@ def errors(at: np.ndarray) -> tuple[float, float]:
 
 def draw(config: Config, target: np.ndarray, paths: list[list[tuple[np.ndarray, Slope]]]) -> None:
     """Draw the target, the images at the start and at the end of the first fit, and the paths of all fits."""
-    (_, first), (_, last) = paths[0][0], paths[0][-1]
-    flat = np.median(target, axis=(0, 1))
-    touched = np.abs(np.stack([target, first.image]) - flat).max(axis=(0, -1)) > SEEN
+    first, last = paths[0][0], paths[0][-1]
+    touched = np.abs(np.stack([target, first[1].image]) - np.median(target, axis=(0, 1))).max(axis=(0, -1)) > SEEN
     rows, columns = (np.flatnonzero(touched.any(axis)) for axis in (1, 0))
     part = slice(max(rows[0] - 5, 0), rows[-1] + 6), slice(max(columns[0] - 5, 0), columns[-1] + 6)
 
     figure = Figure(figsize=(13, 8), layout="constrained")
     axes = figure.subplots(2, 3).ravel()
-    off = ["{:.3f} mm, {:+.2f} degrees off".format(*errors(at)) for at, _ in (paths[0][0], paths[0][-1])]
-    panels = [
-        ("target", target),
-        (f"start, {off[0]}", first.image),
-        (f"end, {off[1]}", last.image),
-        ("start less target", 0.5 + (first.image - target) / 2),
-        ("end less target", 0.5 + (last.image - target) / 2),
-    ]
+    panels = [("target", target)]
+    for name, (at, there) in (("start", first), ("end", last)):
+        panels.append(("{}, {:.3f} mm, {:+.2f} degrees off".format(name, *errors(at)), there.image))
+        panels.append((f"{name} less target", 0.5 + (there.image - target) / 2))
     for axis, (title, image) in zip(axes, panels, strict=False):
         axis.imshow(np.clip(np.asarray(image), 0, 1)[part], interpolation="nearest")
         axis.set_title(title)
         axis.set_axis_off()
     for path in paths:
-        ways = 1e3 * np.stack([at for at, _ in path])
+        ways, turns = 1e3 * np.stack([at for at, _ in path]), [abs(errors(at)[1]) for at, _ in path]
         axes[5].plot(ways[:, 0], ways[:, 1], "-", color="0.8", zorder=1)
-        turns = [abs(errors(at)[1]) for at, _ in path]
         points = axes[5].scatter(ways[:, 0], ways[:, 1], c=turns, s=14, vmin=0, vmax=OFF[1], cmap="viridis")
     figure.colorbar(points, ax=axes[5], label="yaw off by (degrees)")
-    axes[5].set(
-        title=f"the paths of {len(paths)} starts", xlabel="x off by (mm)", ylabel="y off by (mm)", aspect="equal"
-    )
+    axes[5].set(xlabel="x off by (mm)", ylabel="y off by (mm)", aspect="equal")
     drawing.write_figure(config.out, figure, dpi=100)
 
 
 def main(config: Config) -> None:
     """Render a tactile image of the object on the pad, fit the pose to it several times, and draw the result."""
-    laying.check(config)
+    sense.check(config)
     if config.starts < 1:
         raise ValueError(f"--starts is {config.starts}, but it must be at least 1")
     if config.force == 0:
         raise ValueError("--force is 0, but it must be > 0 (N), so that the object leaves an imprint")
     sensor = sts.Sensor() if config.sensor is None else sts.Sensor.load(config.sensor)
-    body = laying.read(config, config.mesh)
-    pose, wrench, words = laying.lay(config, sensor, body)
+    body = sense.read(config, config.mesh)
+    pose, wrench, words = sense.lay(config, sensor, body)
     given = jnp.asarray(pose, jnp.float32), jnp.asarray(wrench, jnp.float32)
     target = touch(sensor, body, *given, resolution=config.resolution)
     empty = touch(sensor, body, given[0].at[2].set(-1), given[1], resolution=config.resolution)
@@ -215,14 +200,6 @@ def main(config: Config) -> None:
         shift = jnp.asarray(at, jnp.float32)
         return slope(sensor, body, *given, shift, target, blur, resolution=config.resolution)
 
-    by_shift, by_turn = (
-        np.sqrt(float(look(np.array(at), BLURS[-1]).loss)) for at in ((OFF[0], 0, 0), (0, 0, np.deg2rad(OFF[1])))
-    )
-    if by_turn < FAINT * by_shift:
-        print(
-            f"note: a turn by {OFF[1]:g} degrees changes the image {by_turn / by_shift:.2f} times as much as a shift "
-            f"by {1e3 * OFF[0]:g} mm: the footprint is nearly round, and its yaw cannot be determined"
-        )
     random = np.random.default_rng(config.seed)
     paths, successes = [], 0
     for number in range(config.starts):

@@ -6,39 +6,22 @@
     python -m experiments.freefall --preset smoke     # about two minutes, for tests
     python -m experiments.freefall --preset paper     # the paper's data size and training schedule: hours, a GPU helps
 
-Results go to `runs/freefall/`: config.json, dataset/, models/NAME/, metrics.json, table.md and figures/*.png. A second
-run with the same `--workdir` resumes after an interruption, and leaves finished results unchanged. `--only train` runs
-one stage. Every field of the configuration is an option too, such as `--collection.num-objects 1000`, see `--help`.
+The results go to `runs/freefall/`. The same command continues after an interruption. See `docs/experiments.md`
+for the files and the options. Every field of the configuration is an option too: `--collection.num-objects 1000`.
 """
 
 import dataclasses
 
 from experiments.shared import config, run
-from sts_jax import dataset, physics
-from sts_jax.training import TrainConfig
+from sts_jax import physics
 
-COLLECTION = dataset.Collection(
-    physics.Freefall(),
-    num_objects=2000,
-    num_per_object=6,
-    num_rendered=4,
-    num_views=8,
-    num_full=20,
-    resolution=(128, 128),
-    shares=(0.9, 0.04, 0.06),
-    seed=2,
-)
+COLLECTION = dataclasses.replace(config.COLLECTION, scenario=physics.Freefall(), num_objects=2000, num_views=8)
 DEFAULT = config.Config(
-    collection=COLLECTION,
+    COLLECTION,
     state_training=dataclasses.replace(config.STATE_TRAINING, steps=1900),
-    training=TrainConfig(batch_size=16, learning_rate=2e-3, schedule="cosine", encoder_epsilon=3.0),
     steps=(1500, 600, 600, 100),
 )
-LONG = dataclasses.replace(
-    DEFAULT,
-    collection=dataclasses.replace(COLLECTION, num_objects=6000, num_per_object=12, shares=(0.97, 0.01, 0.02)),
-    state_training=dataclasses.replace(config.STATE_TRAINING, steps=16000),
-)
+LONG = config.long(DEFAULT, num_per_object=12, steps=16000)
 SMOKE = config.smoke(DEFAULT)
 PAPER = config.paper(COLLECTION, num_objects=340, num_per_object=5)  # 1,700 trajectories
 PRESETS = {"smoke": SMOKE, "default": DEFAULT, "long": LONG, "paper": PAPER}

@@ -26,7 +26,6 @@ import tyro
 
 import sts_jax as sts
 from experiments.shared import drawing, terminal
-from experiments.shared.run import Folder
 from sts_jax import dataset, hardware, storage
 from sts_jax.evaluation import figures, gap
 
@@ -37,8 +36,8 @@ STREAMS = ("visual", "tactile")
 class Config:
     """Options of the command line: the folders of real and simulated images, and how the images are compared."""
 
-    real: Folder  # folder of the real images: a session of `experiments.real collect`
-    simulated: Folder  # folder of the simulated images: a session, or the dataset of an experiment
+    real: Path  # folder of the real images: a session of `experiments.real collect`
+    simulated: Path  # folder of the simulated images: a session, or the dataset of an experiment
     sensor: Path | None = None  # sensor file of the real images. None: the images are rectified already
     simulated_sensor: Path | None = None  # sensor file of a simulated session. None: its images are rectified already
     # how the trajectories of both folders correspond. number: those of equal number show the same object in the same
@@ -50,7 +49,7 @@ class Config:
     resolution: tuple[int, int] | None = None
     names: tuple[str, str] = ("real", "simulated")  # titles of the real and the simulated images in the figure
     rows: int = 4  # number of trajectories in the figure, with two rows each
-    out: Folder = Path("runs/gap")  # folder for gap.txt and gap.png
+    out: Path = Path("runs/gap")  # folder for gap.txt and gap.png
     debug: bool = False  # show the traceback of every error
 
 

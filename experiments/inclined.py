@@ -6,39 +6,18 @@
     python -m experiments.inclined --preset smoke     # about two minutes, for tests
     python -m experiments.inclined --preset paper     # the paper's data size and training schedule: hours, a GPU helps
 
-Results go to `runs/inclined/`: config.json, dataset/, models/NAME/, metrics.json, table.md and figures/*.png. A second
-run with the same `--workdir` resumes after an interruption, and leaves finished results unchanged. `--only train` runs
-one stage. Every field of the configuration is an option too, such as `--collection.num-objects 1000`, see `--help`.
+The results go to `runs/inclined/`. The same command continues after an interruption. See `docs/experiments.md`
+for the files and the options. Every field of the configuration is an option too: `--collection.num-objects 1000`.
 """
 
 import dataclasses
 
 from experiments.shared import config, run
-from sts_jax import dataset, physics
-from sts_jax.training import TrainConfig
+from sts_jax import physics
 
-COLLECTION = dataset.Collection(
-    physics.Inclined(),
-    num_objects=1600,
-    num_per_object=6,
-    num_rendered=4,
-    num_views=4,
-    num_full=20,
-    resolution=(128, 128),
-    shares=(0.9, 0.04, 0.06),
-    seed=2,
-)
-DEFAULT = config.Config(
-    collection=COLLECTION,
-    state_training=dataclasses.replace(config.STATE_TRAINING, steps=2000),
-    training=TrainConfig(batch_size=16, learning_rate=2e-3, schedule="cosine", encoder_epsilon=3.0),
-    steps=(750, 350, 400, 200),
-)
-LONG = dataclasses.replace(
-    DEFAULT,
-    collection=dataclasses.replace(COLLECTION, num_objects=6000, num_per_object=10, shares=(0.97, 0.01, 0.02)),
-    state_training=dataclasses.replace(config.STATE_TRAINING, steps=8000),
-)
+COLLECTION = dataclasses.replace(config.COLLECTION, scenario=physics.Inclined(), num_views=4)
+DEFAULT = config.Config(COLLECTION)
+LONG = config.long(DEFAULT)
 SMOKE = config.smoke(DEFAULT)
 PAPER = config.paper(COLLECTION, num_objects=480, num_per_object=5)  # 2,400 trajectories
 PRESETS = {"smoke": SMOKE, "default": DEFAULT, "long": LONG, "paper": PAPER}

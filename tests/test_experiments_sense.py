@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 import sts_jax as sts
 from experiments import sense
-from experiments.shared import laying
 
 pytestmark = pytest.mark.slow
 
@@ -38,11 +37,10 @@ def test_all_streams_of_a_class_in_one_picture(tmp_path, capsys):
     assert imprint is not None
     assert 0 < float(imprint[1]) < 3
     assert int(imprint[2]) > 0
-    assert re.fullmatch(r"[\d.e-]+ s a frame of 32 x 24 \([\d.]+ s the first\)", lines[3])
-    assert lines[4] == str(out)
+    assert lines[3] == str(out)
 
-    body, sensor = laying.read(config, "bottle"), sts.Sensor()
-    pose, wrench, _ = laying.lay(config, sensor, body)
+    body, sensor = sense.read(config, "bottle"), sts.Sensor()
+    pose, wrench, _ = sense.lay(config, sensor, body)
     given = (jnp.asarray(x, jnp.float32) for x in (pose, wrench))
     frame = sts.sense(sensor, body, *given, resolution=TINY)
     picture = np.asarray(Image.open(out))
@@ -61,10 +59,10 @@ def test_all_streams_of_a_class_in_one_picture(tmp_path, capsys):
 
 def test_a_file_is_pressed_by_its_weight(box, tmp_path, capsys):
     config = sense.Config(str(box), out=tmp_path / "box.png", resolution=TINY, mass=0.2, crop=True)
-    body, sensor = laying.read(config, str(box)), sts.Sensor()
+    body, sensor = sense.read(config, str(box)), sts.Sensor()
     frame, _, words = sense.look(config, sensor, body)
     assert "0.2 kg, pressed by 1.96 N" in words
-    assert float(frame.pressure.sum()) * 1e-6 == pytest.approx(0.2 * laying.G, rel=0.005)
+    assert float(frame.pressure.sum()) * 1e-6 == pytest.approx(0.2 * sense.G, rel=0.005)
     # its largest face, 40 x 30 mm, by p = k d
     assert "deepest imprint 0.82 mm, contact area 1200 mm2, balanced" in words
     assert bool(frame.balanced)
@@ -74,10 +72,10 @@ def test_a_file_is_pressed_by_its_weight(box, tmp_path, capsys):
 
 def test_the_object_lies_at_the_configured_place(box):
     config = sense.Config(str(box), mass=0.1, position=(0.02, -0.01), turn=90.0)
-    body = laying.read(config, str(box))
+    body = sense.read(config, str(box))
 
     def corners(config):
-        pose, wrench, words = laying.lay(config, sts.Sensor(), body)
+        pose, wrench, words = sense.lay(config, sts.Sensor(), body)
         w, x, y, z = pose[3:]
         return Rotation.from_quat([x, y, z, w]).apply(np.asarray(body.vertices, float)) + pose[:3], wrench, words
 
@@ -118,7 +116,7 @@ def test_a_sensor_of_a_file_is_used(box, tmp_path):
     soft = sense.look(
         sense.Config(str(box), resolution=TINY, mass=0.1),
         sts.Sensor.load(path),
-        laying.read(sense.Config(str(box), mass=0.1), str(box)),
+        sense.read(sense.Config(str(box), mass=0.1), str(box)),
     )[2]
     assert "deepest imprint 0.82 mm" in soft
 
@@ -127,7 +125,7 @@ def test_a_sensor_of_a_file_is_used(box, tmp_path):
     ("changes", "message"),
     [
         ({"mesh": "teapot"}, r"teapot is neither a file nor an object class \(bottle, camera"),
-        ({"resolution": (0, 64)}, r"resolution is \(0, 64\).*at least 1 pixel"),
+        ({"resolution": (0, 64)}, r"resolution \(height, width\) must be > 0, got \(0, 64\)"),
         ({"mass": 0.0}, "mass is 0.0, but it must be > 0"),
         ({"force": -1.0}, "--force is -1.0, but it must be >= 0"),
         ({"light": 1.5}, "light is 1.5"),

@@ -9,9 +9,6 @@ from statespace_config import STATE, state_model
 
 import sts_jax as sts
 from experiments import ship
-from sts_jax import training
-
-SIDE = STATE.input_size
 
 
 @pytest.fixture
@@ -19,7 +16,6 @@ def models(tmp_path, monkeypatch):
     """The library's folder of models, of which there are none."""
     monkeypatch.setattr(ship, "MODELS", tmp_path / "library")
     monkeypatch.setattr("sts_jax.predict.MODELS", tmp_path / "library")
-    monkeypatch.setattr(ship, "bottles", lambda view: np.random.default_rng(0).random((3, SIDE, SIDE, 3), np.float32))
     monkeypatch.chdir(tmp_path)
     return tmp_path / "library"
 
@@ -43,11 +39,7 @@ def content(folder):
 @pytest.mark.slow
 def test_a_shipped_model_is_loaded_by_its_name_and_replaced_by_the_next(models, workdir):
     line = ship.ship(workdir, "falls")
-    assert re.fullmatch(
-        r"falls: 0\.\d MB of at most 12; largest difference of predictions from 3 visual images: "
-        r"0\.00\d\d in the visual image, \d+\.\d+ mm in position \(median 0\.\d+ mm\)",
-        line,
-    )
+    assert re.fullmatch(r"falls: 0\.\d MB of at most 12", line)
     assert sts.Predictor.load("falls").model.config == STATE
     files = content(models / "falls")
     assert sorted(files) == ["blank.npz", "checkpoints/00000000/weights.npz", "config.json", "manifest.json"]
@@ -78,17 +70,7 @@ def test_an_earlier_model_stays_if_the_new_one_is_refused(models, workdir, monke
     assert [path.name for path in models.iterdir()] == ["falls"]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["", "..", "runs/falls", "free fall"])
-def test_a_name_with_other_characters_is_refused(models, workdir, name):
+@pytest.mark.parametrize("name", ["..", "runs/falls", "free fall"])
+def test_a_name_with_other_characters_is_refused(models, tmp_path, name):
     with pytest.raises(ValueError, match="must be letters, digits and underscores"):
-        ship.ship(workdir, name)
-
-
-@pytest.mark.slow
-def test_bottles_are_seen_at_rest_and_in_the_air(monkeypatch):
-    monkeypatch.setattr(ship, "NUM", 2)
-    images = ship.bottles(training.Preprocessing(resolution=(SIDE, SIDE)))
-    assert images.shape == (2, SIDE, SIDE, 3)
-    dark = (images < images.max((1, 2), keepdims=True) - 0.2).any(-1).mean((1, 2))
-    assert dark[0] > dark[1] > 0  # an object in the air is farther from the camera
+        ship.ship(tmp_path, name)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 import sts_jax as sts
 from benchmarks import depth
-from experiments.shared.laying import Config, lay
+from experiments.sense import Config, lay
 from sts_jax import geometry, objects, sense, tactile
 
 SENSOR = sts.Sensor()

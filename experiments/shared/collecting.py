@@ -15,7 +15,6 @@ import sts_jax as sts
 from experiments.shared import commissioning, drawing
 from experiments.shared.device import FIELD_OF_VIEW, TwinConfig, make_twin
 from experiments.shared.page import CollectPage
-from experiments.shared.run import Folder
 from experiments.shared.terminal import Bar, Terminal, say
 from sts_jax import hardware, storage
 from sts_jax.hardware import Action, AutomaticPerson, EmptyPad, GuideConfig, Person, Stage, View, twin
@@ -40,7 +39,7 @@ _WAIT_S = 0.1  # time of the computer's clock between two attempts while the ses
 class Collect:
     """Guide a person through trajectories, and save images of the held object, and of the object at rest."""
 
-    workdir: Folder = Path("runs/real")  # work directory. The trajectories go to its folder `dataset`
+    workdir: Path = Path("runs/real")  # work directory. The trajectories go to its folder `dataset`
     sensor: Path | None = None  # sensor file of experiments.commission, or its folder
     camera: str | None = None  # path or URL of the camera. None: the camera of the sensor file
     leds: str | None = None  # serial port of the LED controller. None: found by the serial number in the sensor file
@@ -64,7 +63,7 @@ class Collect:
 class Review:
     """List, discard, restore or confirm trajectories, check their files, or draw their images."""
 
-    workdir: Folder = Path("runs/real")  # work directory. The trajectories are in its folder `dataset`
+    workdir: Path = Path("runs/real")  # work directory. The trajectories are in its folder `dataset`
     discard: tuple[int, ...] = ()  # numbers of trajectories to move to the folder `discarded`
     restore: tuple[int, ...] = ()  # numbers of discarded trajectories to move back
     # numbers of trajectories to confirm. They have both pairs of images, but the session was interrupted before they

@@ -15,7 +15,6 @@ from PIL import Image, UnidentifiedImageError
 
 import sts_jax as sts
 from experiments.shared import drawing
-from experiments.shared.run import Folder
 from experiments.shared.terminal import say
 from sts_jax import hardware, storage
 from sts_jax.hardware.calibration import FEWEST_CORNERS, FEWEST_IMAGES, PARTS
@@ -38,7 +37,7 @@ class Config:
 
     camera: str | None = None  # path of the camera, such as /dev/v4l/by-id/..., or URL. None: list cameras and stop
     leds: str | None = None  # serial port of the LED controller, such as /dev/ttyACM0. None: list ports and stop
-    out: Folder = Path("bench")  # folder for the sensor file
+    out: Path = Path("bench")  # folder for the sensor file
     width: int = 1640  # width of the camera's images (pixels)
     height: int = 1232  # height of the camera's images (pixels)
     fps: float | None = None  # frame rate (frames/s). None: the camera's own rate

@@ -5,12 +5,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import optax
 
 import sts_jax as sts
 from sts_jax import dataset, evaluation, mvae, statespace, training
-from sts_jax.dataset.collection import PARTS
 from sts_jax.training import Preprocessing, TrainConfig
 
 # The models of each kind and their modalities. The first model of a kind is the main one, which the tables and figures
@@ -34,17 +32,39 @@ TITLES = {
 SMALLEST = 16  # side of the smallest images in which the outline of an object can be judged (pixels)
 SPLITS = ("object", "trajectory")
 
+# What the experiments have in common. The presets change these values.
+COLLECTION = dataset.Collection(
+    num_objects=1600,
+    num_per_object=6,
+    num_rendered=4,
+    num_full=20,
+    resolution=(128, 128),
+    shares=(0.9, 0.04, 0.06),
+    seed=2,
+)
+TRAINING = TrainConfig(batch_size=16, learning_rate=2e-3, schedule="cosine", encoder_epsilon=3.0)
+STATE_TRAINING = TrainConfig(
+    steps=2000,
+    batch_size=32,
+    learning_rate=1.5e-3,
+    schedule="cosine",
+    warmup=150,
+    b2=0.99,
+    clip=200.0,
+    beta_warmup=0.2,
+)
+
 
 @dataclasses.dataclass(frozen=True)
 class Config:
     """The configuration of an experiment: its dataset, its models, their training and their evaluation."""
 
     collection: dataset.Collection  # the dataset
-    training: TrainConfig  # training of the paper's models
-    state_training: TrainConfig  # training of the state-space model
+    training: TrainConfig = TRAINING  # training of the paper's models
+    state_training: TrainConfig = STATE_TRAINING  # training of the state-space model
     model: Literal["statespace", "paper"] = "statespace"  # models to train: the state-space model, or the paper's four
     # numbers of gradient steps, one for each of the paper's models. None: each is trained for training.epochs epochs
-    steps: tuple[int, ...] | None = None
+    steps: tuple[int, ...] | None = (750, 350, 400, 200)
     # modalities that the paper's models learn to predict when only some modalities are given: all of them, or only
     # the given ones (own, as in the paper)
     targets: Literal["all", "own"] = "all"
@@ -163,16 +183,13 @@ class Extensions:
 NONE = Extensions()
 
 
-# The same for all scenarios. The presets set `steps`.
-STATE_TRAINING = TrainConfig(
-    batch_size=32,
-    learning_rate=1.5e-3,
-    schedule="cosine",
-    warmup=150,
-    b2=0.99,
-    clip=200.0,
-    beta_warmup=0.2,
-)
+def long(default: Config, *, num_per_object: int = 10, steps: int = 8000) -> Config:
+    """A configuration with more objects and gradient steps, which takes hours."""
+    collection = dataclasses.replace(
+        default.collection, num_objects=6000, num_per_object=num_per_object, shares=(0.97, 0.01, 0.02)
+    )
+    training = dataclasses.replace(default.state_training, steps=steps)
+    return dataclasses.replace(default, collection=collection, state_training=training)
 
 
 def smoke(default: Config) -> Config:
@@ -202,21 +219,20 @@ def smoke(default: Config) -> Config:
 def paper(collection: dataset.Collection, *, num_objects: int, num_per_object: int) -> Config:
     """The models, the training schedule and the options of the paper, for the scenario and classes of a collection."""
     return Config(
-        collection=dataclasses.replace(
-            collection,
+        dataset.Collection(
+            collection.scenario,
+            collection.categories,
             num_objects=num_objects,
             num_per_object=num_per_object,
             num_full=num_objects * num_per_object,  # all trajectories, with about 60 frames each
-            num_rendered=None,
-            num_views=0,
-            resolution=(64, 64),
             crop=True,
-            shares=(0.7, 0.1, 0.2),
             objects_per_shard=20,
+            seed=collection.seed,
         ),
         training=TrainConfig(epochs=200, batch_size=64, learning_rate=1e-3),
-        state_training=STATE_TRAINING,
+        state_training=dataclasses.replace(STATE_TRAINING, steps=None),
         model="paper",
+        steps=None,
         targets="own",
         rotation="quaternion",
         mask_blank_touch=False,
@@ -226,7 +242,7 @@ def paper(collection: dataset.Collection, *, num_objects: int, num_per_object: i
 
 def check(config: Config, own: Extensions = NONE) -> None:
     """Find a mistake in the configuration before the dataset is collected."""
-    collection, names = config.collection, tuple(MODELS["paper"])
+    collection = config.collection
     collection.check()
     height, width = collection.resolution
     if height != width:
@@ -235,22 +251,18 @@ def check(config: Config, own: Extensions = NONE) -> None:
         raise ValueError(
             "collection.crop must be False for the state-space model: give --collection.no-crop, or --model paper"
         )
-    allowed = image_sizes(config)
-    if not allowed:
+    if config.image_size < SMALLEST or height % config.image_size:
         raise ValueError(
-            f"model {config.model!r} supports no images of collection.resolution {height} x {width}: give 128 128"
+            f"image_size must be >= {SMALLEST} and divide the side of collection.resolution, {height}, got "
+            f"{config.image_size}"
         )
-    if config.image_size not in allowed:
-        listed, nearest = ", ".join(map(str, allowed)), min(allowed, key=lambda size: abs(size - config.image_size))
-        raise ValueError(
-            f"image_size must be one of {listed} for collection.resolution {height} {width} and model "
-            f"{config.model!r}, got {config.image_size}: give --image-size {nearest}, or another resolution"
-        )
-    if config.model == "paper" and config.steps is not None and len(config.steps) != len(names):
-        raise ValueError(
-            f"steps must have one number for each model ({', '.join(names)}), or be None for --training.epochs, got "
-            f"{config.steps}: change --steps"
-        )
+    if config.model == "paper":
+        training.paper_model(("visual",), config.preprocessing)  # raises an error if no network has this image size
+        if config.steps is not None and len(config.steps) != len(MODELS["paper"]):
+            raise ValueError(
+                f"steps must have one number for each model ({', '.join(MODELS['paper'])}), or be None for "
+                f"--training.epochs, got {config.steps}"
+            )
     trained, option = config.schedule, "state_training" if config.model == "statespace" else "training"
     if trained.schedule == "cosine" and trained.steps is not None and trained.warmup >= trained.steps:
         raise ValueError(f"{option}.warmup must be smaller than {option}.steps ({trained.steps}), got {trained.warmup}")
@@ -270,38 +282,16 @@ def check(config: Config, own: Extensions = NONE) -> None:
 
 def _check_parts(collection: dataset.Collection, split: str) -> None:
     """Raise a `ValueError` unless each part of a split has at least one object or trajectory."""
-    shares, count, items = np.array(collection.shares), collection.num_objects, "objects"
-    parts: tuple[str, ...] = PARTS
-    if split == "trajectory":
-        rest = evaluation.train_share(collection.shares, split)
-        shares, count, items = np.array([rest, 1 - rest]), count * collection.rendered_per_object, "trajectories"
-        parts = ("train", "test")
-    sizes = np.diff(np.round(np.cumsum([0, *shares]) * count)).astype(int)
-    if min(sizes) >= 1:
-        return
-    more = "raise --collection.num-objects"
-    if collection.meshes is not None:
-        more = "add usable objects to the folder (objects.txt in the work directory lists the unusable ones)"
-    raise ValueError(
-        f"the part {parts[sizes.argmin()]!r} of the split by {split} is empty: there are {count} {items}, and "
-        f"collection.shares is {collection.shares}. To get at least one item in each part, {more}, or give other "
-        "--collection.shares, such as 0.7 0.1 0.2"
-    )
-
-
-def image_sizes(config: Config) -> tuple[int, ...]:
-    """The values of `image_size` that the model and the resolution of the collected images allow, in pixels."""
-    side = config.collection.resolution[0]
-    return tuple(size for size in range(SMALLEST, side + 1) if side % size == 0 and _fits(config.model, side, size))
-
-
-def _fits(model: Literal["statespace", "paper"], side: int, size: int) -> bool:
-    """Return whether the model can predict images with a side of `size` from images with a side of `side` pixels."""
-    try:
-        if model == "statespace":
-            statespace.Config(input_size=side, image_size=size)
-        else:
-            training.paper_model(("visual",), Preprocessing((size, size)))
-    except ValueError:
-        return False
-    return True
+    if split == "object":
+        items, sizes = "objects", {name: len(part) for name, part in dataset.split_objects(collection).items()}
+    else:
+        items, count = "trajectories", collection.num_objects * collection.rendered_per_object
+        train = round(evaluation.train_share(collection.shares, split) * count)
+        sizes = {"train": train, "test": count - train}
+    name = min(sizes, key=sizes.__getitem__)
+    if sizes[name] < 1:
+        more = "raise --collection.num-objects" if collection.meshes is None else "add usable objects to the folder"
+        raise ValueError(
+            f"the part {name!r} of the split by {split} is empty: there are {sum(sizes.values())} {items}, and "
+            f"collection.shares is {collection.shares}: {more}, or give other --collection.shares, such as 0.7 0.1 0.2"
+        )

@@ -20,36 +20,18 @@ JUDGED_SUBSETS = ("visual", "visual and tactile", "all inputs")  # inputs for wh
 
 def check_picture(path: Path) -> None:
     """Check before any work that a picture can be written to a path."""
-    if path.is_dir():
-        raise IsADirectoryError(f"{path} is a folder: give the name of a picture, such as {path / 'picture.png'}")
-    if path.suffix.lower() not in PICTURES:
-        raise ValueError(f"{path} has the suffix {path.suffix!r}, but it must be one of {', '.join(PICTURES)}")
-    if not path.parent.is_dir():
-        raise FileNotFoundError(
-            f"the folder {path.parent} of {path.name} does not exist: make this folder, or give another path"
-        )
-    _try_to_write(path.parent)
-    if path.exists():
-        try:
-            path.open("ab").close()
-        except OSError as error:
-            raise type(error)(f"{path} cannot be overwritten ({error.strerror}): give another path") from error
+    if path.is_dir() or path.suffix.lower() not in PICTURES:
+        raise ValueError(f"{path} must be the name of a picture that ends in one of {', '.join(PICTURES)}")
+    make_folder(path.parent)
 
 
 def make_folder(path: Path) -> None:
     """Make a folder if it does not exist, and check that it can be written to."""
     try:
         path.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=path).close()
     except OSError as error:
-        raise type(error)(f"the folder {path} cannot be made ({error.strerror}): give another path") from error
-    _try_to_write(path)
-
-
-def _try_to_write(folder: Path) -> None:
-    try:
-        tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
-        raise type(error)(f"the folder {folder} cannot be written to ({error.strerror}): give another path") from error
+        raise type(error)(f"cannot write to the folder {path} ({error.strerror}): give another path") from error
 
 
 def write_picture(path: Path, picture: Image.Image) -> None:
@@ -77,23 +59,18 @@ def draw(
 
     `rerolled` are poses at rest of re-rolls of the first held-out trajectories, shape (times, n, 7).
     """
-    config, name = run.config, run.workdir.name
-    drawn, model = [], TITLES[run.main_model]
-    num_shown = min(config.num_shown, len(test.object))
+    name, model, num = run.workdir.name, TITLES[run.main_model], min(run.config.num_shown, len(test.object))
+    drawn = []
     for given, stem in (("visual", ""), ("all inputs", "-all")):
-        predicted = shown.get(f"{model}, from {given}")
+        predicted, head = shown.get(f"{model}, from {given}"), f"{name}, from {given}"
         if predicted is None:
             continue
-        title = f"{name}, from {given}: the first {num_shown} held-out trajectories"
         drawn.append(run.figures / f"predictions{stem}.png")
-        evaluation.figures.predictions(
-            drawn[-1], test, predicted, num=num_shown, title=title, scenario=config.collection.scenario
-        )
+        title, scenario = f"{head}: the first {num} held-out trajectories", run.config.collection.scenario
+        evaluation.figures.predictions(drawn[-1], test, predicted, num=num, title=title, scenario=scenario)
         if predicted.samples is not None and predicted.samples.pose is not None:
             drawn.append(run.figures / f"ends{stem}.png")
-            _draw_ends(
-                drawn[-1], f"{name}, from {given}", run.sensor, test, predicted.samples.pose, rerolled[:, :num_shown]
-            )
+            _draw_ends(drawn[-1], head, run.sensor, test, predicted.samples.pose, rerolled[:, :num])
     judged = {f"from {given}": scores.get(f"{model}, from {given}", {}) for given in JUDGED_SUBSETS}
     if any(evaluation.CALIBRATION in errors for errors in judged.values()):
         drawn.append(run.figures / "calibration.png")
@@ -106,17 +83,10 @@ def _draw_ends(
 ) -> None:
     """Draw sampled and re-rolled positions at rest for the start whose re-rolls have the widest spread."""
     spread = np.linalg.norm(rerolled[..., :2] - rerolled[..., :2].mean(0), axis=-1).mean(0)
-    item = int(spread.argmax())
-    evaluation.figures.ends(
-        path,
-        (float(sensor.gel.size[0]), float(sensor.gel.size[1])),
-        test.pose[item, 0],
-        test.pose[item, 1],
-        rerolled[:, item],
-        sampled[:, item],
-        title=f"{head}: ends of #{test.trajectory[item]}, the start with the widest spread among the first "
-        f"{len(spread)}",
-    )
+    item, (width, height) = int(spread.argmax()), sensor.gel.size
+    title = f"{head}: ends of #{test.trajectory[item]}, the start with the widest spread among the first {len(spread)}"
+    poses = (*test.pose[item], rerolled[:, item], sampled[:, item])
+    evaluation.figures.ends(path, (float(width), float(height)), *poses, title=title)
 
 
 def draw_strip(path: Path, collection: dataset.Collection, sensor: sts.Sensor, data: dataset.Dataset) -> None:
@@ -127,16 +97,10 @@ def draw_strip(path: Path, collection: dataset.Collection, sensor: sts.Sensor, d
     one, hidden = ({name: leaf[index] for name, leaf in x.items()} for x in (data.trajectory, data.hidden))
     images = data.strip(index)
     body = dataset.make_bodies(collection, np.array([one["body"]]))[0]
-    what = describe(collection.scenario, dataset.class_names(collection)[one["body"]], one, hidden)
-    evaluation.figures.strip(
-        path,
-        one["time"],
-        views(body, one["pose"], one["gravity"], sensor, collection.scenario.wall),
-        images.visual / 255,
-        images.tactile / 255,
-        one["wrench"],
-        title=f"trajectory {index}: {what}",
-    )
+    outside = views(body, one["pose"], one["gravity"], sensor, collection.scenario.wall)
+    words = describe(collection.scenario, dataset.class_names(collection)[one["body"]], one, hidden)
+    streams, title = (images.visual / 255, images.tactile / 255), f"trajectory {index}: {words}"
+    evaluation.figures.strip(path, one["time"], outside, *streams, one["wrench"], title=title)
 
 
 def views(body: sts.objects.Body, pose: np.ndarray, gravity: np.ndarray, sensor: sts.Sensor, wall: float) -> np.ndarray:

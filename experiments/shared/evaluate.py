@@ -90,17 +90,18 @@ def evaluate(run: Run, data: dataset.Dataset, own: Extensions = NONE) -> str:
     _check_measurements(run.folder(run.main_model), own)
     pairs = _pairs(run, data, own)
     test, judge = pairs.test, evaluation.scorer(scenario, pairs.train, metrics=own.scored)
-    rerolls = ceilings(run, data, test, judge, own.metrics)  # re-rolls have no further modalities
-    references = evaluation.baselines(scenario, pairs.train, test)
-    scores = {**rerolls.scores, **{title: judge(row, test) for title, row in references.items()}}
     with Bar() as bar:
+        few = test.take(slice(config.num_rerolled))
+        total = config.rerolls * len(few.object)
+        scores, rerolled = reroll(run, few, judge, lambda done: bar("re-roll", done, total))
+        scores |= {title: judge(row, test) for title, row in evaluation.baselines(scenario, pairs.train, test).items()}
         predicted, shown = _scored(run, pairs, judge, bar)
         scores |= predicted
         summary = evaluation.summarise(scores, test, metrics=own.scored, outcomes=scenario.outcomes)
         bar("evaluate", len(predicted), len(predicted), "intervals done")
 
     logs = {TITLES[name]: training.records(run.folder(name)) for name in MODELS[config.model]}
-    figures = drawing.draw(run, test, scores, shown, rerolls.pose)
+    figures = drawing.draw(run, test, scores, shown, rerolled)
     figures.append(run.figures / "training.png")
     evaluation.figures.training_curves(figures[-1], logs)
     if not run.suffix and len(data.full_trajectories()):
@@ -109,7 +110,7 @@ def evaluate(run: Run, data: dataset.Dataset, own: Extensions = NONE) -> str:
 
     model = TITLES[run.main_model]
     title = f"{workdir.name}: the last frame predicted from the first, held out by {run.split}"
-    notes = [*_notes(run, logs), *_gains(model, scores, test)]
+    notes = _notes(run, logs, scores, test)
     text = evaluation.table(summary, title=title, rows=main_rows(model, list(shown)), notes=notes, columns=own.columns)
     full = evaluation.full_table(summary, title=title, notes=notes, metrics=own.scored)
     storage.write_bytes(table, text.encode())
@@ -183,90 +184,31 @@ def main_rows(model: str, titles: Sequence[str]) -> list[str]:
     return [evaluation.CEILING, *evaluation.BASELINES, *[title for title in wanted if title in titles][:5]]
 
 
-def _notes(run: Run, logs: Mapping[str, Sequence[Mapping[str, float]]]) -> list[str]:
-    """The notes below a table: the schedule of the training, and an explanation of the ceiling."""
+def _notes(
+    run: Run, logs: Mapping[str, Sequence[Mapping]], scores: Mapping[str, evaluation.Scores], test: dataset.Pairs
+) -> list[str]:
+    """The notes below a table: the schedule of the training, the ceiling, and what touch adds to vision."""
     steps = ", ".join(f"{name} {log[-1]['step'] if log else 0}" for name, log in logs.items())
-    return [
+    notes = [
         f"Gradient steps: {steps}, batch {run.config.schedule.batch_size}.",
         f"Ceiling: {run.config.rerolls} re-rolls of the hidden values of each start. Touch can reveal a part of these "
         "values, and a model from touch can exceed it.",
     ]
-
-
-def _gains(model: str, scores: Mapping[str, evaluation.Scores], test: dataset.Pairs) -> list[str]:
-    """A note on the share by which touch lowers the log loss of the outcome, if the main model predicts outcomes."""
-    before, after = (scores.get(f"{model}, from {given}") for given in ("visual", "visual and tactile"))
-    gain = None if before is None or after is None else evaluation.gain(before, after, test)
-    if gain is None:
-        return []
-    return [
-        f"Touch removes {gain['value']:.3f} [{gain['low']:.3f}, {gain['high']:.3f}] of the outcome's log loss from "
-        "vision."
-    ]
-
-
-class Ceilings(NamedTuple):
-    """Re-rolls of held-out trajectories, and the scores of predictions made from them."""
-
-    scores: dict[str, evaluation.Scores]  # scores of the mean of the re-rolls, and of a single re-roll
-    pose: np.ndarray  # poses at rest, shape (times, n, 7)
-    outcome: np.ndarray  # numbers of the outcomes, int of shape (times, n)
-
-
-def ceilings(
-    run: Run, data: dataset.Dataset, test: dataset.Pairs, judge: Judge, metrics: Sequence[evaluation.Metric]
-) -> Ceilings:
-    """Read the re-rolls of the first held-out trajectories from `ceiling.npz`, or simulate them and write this file."""
-    config, workdir = run.config, run.workdir
-    part, path = f"ceiling by {run.split}", workdir / f"ceiling{run.suffix}.npz"
-    few = test.take(slice(config.num_rerolled))
-    inputs = {
-        "dataset": data.identity,
-        "the held-out list": storage.digest(few.trajectory.tolist()),
-        "the re-rolls": storage.digest([config.rerolls, SEED]),
-        "the list of metrics": storage.digest(sorted(metric.name for metric in metrics)),
-    }
-    reason = stale(workdir, part, inputs)
-    if reason is not None:
-        if path.exists():
-            say(f"ceilings: again, because {reason}")
-        with Bar() as bar:
-            total = config.rerolls * len(few.object)
-            made = reroll(run, few, config.rerolls, judge, lambda done: bar("re-roll", done, total))
-        storage.write_arrays(path, _flat(made))
-        record(workdir, part, inputs, [path])
-    return _restored(storage.read_arrays(path, f"delete {path.name}, and evaluate again"))
+    rows = [f"{TITLES[run.main_model]}, from {given}" for given in ("visual", "visual and tactile")]
+    if all(row in scores for row in rows) and (gain := evaluation.gain(scores[rows[0]], scores[rows[1]], test)):
+        interval = f"{gain['value']:.3f} [{gain['low']:.3f}, {gain['high']:.3f}]"
+        notes.append(f"Touch removes {interval} of the outcome's log loss from vision.")
+    return notes
 
 
 def reroll(
-    run: Run,
-    test: dataset.Pairs,
-    times: int,
-    judge: Judge,
-    progress: Callable[[int], object] | None = None,
-) -> Ceilings:
-    """Re-roll trajectories, and score two predictions of each: the mean of its re-rolls, and one of its re-rolls."""
-    mean = evaluation.ceiling(run.config.collection, run.sensor, test, times, jax.random.key(SEED), progress=progress)
+    run: Run, test: dataset.Pairs, judge: Judge, progress: Callable[[int], object]
+) -> tuple[dict[str, evaluation.Scores], np.ndarray]:
+    """Re-roll trajectories. Returns the scores of the mean and of one of the re-rolls, and the poses (times, n, 7)."""
+    key, times = jax.random.key(SEED), run.config.rerolls
+    mean = evaluation.ceiling(run.config.collection, run.sensor, test, times, key, progress=progress)
     samples = mean.samples
     assert samples is not None
     assert samples.pose is not None
-    assert samples.outcome is not None
     one = evaluation.Predicted(*(None if leaf is None else leaf[0] for leaf in samples[:4]))
-    scores = {evaluation.CEILING: judge(mean, test), evaluation.ONE_REROLL: judge(one, test)}
-    return Ceilings(scores, samples.pose, samples.outcome)
-
-
-def _flat(made: Ceilings) -> dict[str, np.ndarray]:
-    """All arrays by a path such as `one re-roll/position`, for a file."""
-    errors = {f"{name}/{metric}": x for name, scores in made.scores.items() for metric, x in scores.items()}
-    return {"pose": made.pose, "outcome": made.outcome, **errors}
-
-
-def _restored(arrays: dict[str, np.ndarray]) -> Ceilings:
-    """The inverse of `_flat`."""
-    scores: dict[str, evaluation.Scores] = {name: {} for name in evaluation.CEILINGS}
-    for path, errors in arrays.items():
-        if "/" in path:
-            name, metric = path.split("/", 1)
-            scores[name][metric] = errors
-    return Ceilings(scores, arrays["pose"], arrays["outcome"])
+    return {evaluation.CEILING: judge(mean, test), evaluation.ONE_REROLL: judge(one, test)}, samples.pose

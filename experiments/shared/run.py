@@ -22,31 +22,11 @@ Stage = Literal["collect", "train", "evaluate"]
 Preset = TypeVar("Preset")  # type of a configuration
 
 
-def _folder(words: list[str]) -> Path:
-    if not words[0].strip():
-        raise ValueError("the name of the folder is empty: give a path, or '.' for the current directory")
-    return Path(words[0])
-
-
-# An option that is the path of a folder. An empty path is refused, because it would be the current directory. It often
-# comes from an unset variable of the shell.
-Folder = Annotated[
-    Path,
-    tyro.constructors.PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="PATH",
-        instance_from_str=_folder,
-        is_instance=lambda value: isinstance(value, Path),
-        str_from_instance=lambda path: [str(path)],
-    ),
-]
-
-
 @dataclasses.dataclass(frozen=True)
 class Args:
     """Options of the command line of an experiment."""
 
-    workdir: Folder  # folder for the results
+    workdir: Path  # folder for the results
     # configuration of the preset. Each of its fields is an option
     config: Annotated[Config, tyro.conf.arg(name="")]
     preset: Literal["smoke", "default", "long", "paper"] = "default"  # set of default values for the options
@@ -55,7 +35,7 @@ class Args:
     # each range (off), a wider range of friction (wide-friction), or contents that may lie on any side of the
     # object (off-centre)
     hidden: sts.physics.Variant = "default"
-    objects: Folder | None = None  # folder of mesh files or of ShapeNetSem, whose objects replace the procedural ones
+    objects: Path | None = None  # folder of mesh files or of ShapeNetSem, whose objects replace the procedural ones
     # classes of the objects. Empty: those of the experiment, or all classes of --objects if it has none of these
     classes: tuple[str, ...] = ()
     # length of one unit of the files in --objects (m), such as 0.001 for millimetres. None: that of ShapeNetSem's
@@ -116,7 +96,6 @@ def with_meshes(collection: dataset.Collection, folder: Path, args: Args) -> dat
     """Replace the objects of a collection by those of a folder, with about the same number of trajectories in total."""
     classes = sts.objects.library(folder).classes
     taken = args.classes or tuple(name for name in classes if name in collection.categories) or classes
-    others = ", ".join(name for name in classes if name not in taken)
     path = args.workdir / "objects.txt"
     with storage.lock(args.workdir):  # so that another run in this folder does not lose its listing
         meshes, listing = dataset.survey_meshes(
@@ -129,24 +108,19 @@ def with_meshes(collection: dataset.Collection, folder: Path, args: Args) -> dat
             cache=cache_folder() / "objects",
             progress=say,
         )
+        others = ", ".join(name for name in classes if name not in taken)
         if others:
             listing += f"classes left out: {others}; --classes takes others\n"
-        # The stage `collect` appends the objects that it left out, so the file may be longer than this listing.
-        if not (path.exists() and path.read_text(errors="replace").startswith(listing)):
+        if not path.exists() or path.read_bytes() != listing.encode():
             storage.write_bytes(path, listing.encode())
-    say(f"classes used: {', '.join(taken)}" + (f". Left out: {others}" if others else ""))
-    say(f"{len(meshes.names)} objects can be used. {path} lists these and the objects left out")
+    count = len(meshes.names)
+    say(f"{count} objects of the classes {', '.join(taken)} can be used. {path} lists these and the objects left out")
     each, rendered = (
-        max(count, round(collection.num_objects * count / len(meshes.names)))
-        for count in (collection.num_per_object, collection.rendered_per_object)
+        max(number, round(collection.num_objects * number / count))
+        for number in (collection.num_per_object, collection.rendered_per_object)
     )
-    return dataclasses.replace(
-        collection,
-        meshes=meshes,
-        num_objects=len(meshes.names),
-        num_per_object=each,
-        num_rendered=None if collection.num_rendered is None else rendered,
-    )
+    rendered = None if collection.num_rendered is None else rendered
+    return dataclasses.replace(collection, meshes=meshes, num_objects=count, num_per_object=each, num_rendered=rendered)
 
 
 def main(config: Config, workdir: Path, *, only: Stage | None = None, own: Extensions = NONE) -> None:
@@ -161,7 +135,9 @@ def main(config: Config, workdir: Path, *, only: Stage | None = None, own: Exten
     check(config, own)
     sensor = sts.Sensor()
     with storage.lock(workdir):
-        data = collect(config, workdir, sensor) if only in (None, "collect") else _collected(config, workdir)
+        storage.claim(workdir / "config.json", dataclasses.asdict(config))
+        folder = workdir / "dataset"
+        data = collect(config.collection, sensor, folder) if only in (None, "collect") else dataset.load(folder)
         if only == "collect":
             return
         for split in config.splits:
@@ -169,61 +145,20 @@ def main(config: Config, workdir: Path, *, only: Stage | None = None, own: Exten
             if only in (None, "train"):
                 train(run, data, own)
             if only in (None, "evaluate"):
-                _check_trained(run)
                 print(evaluate(run, data, own))
 
 
-def claim(config: Config, workdir: Path) -> None:
-    """Write `config.json`, or check that the work directory has this configuration."""
-    storage.claim(workdir / "config.json", dataclasses.asdict(config))
-
-
-def collect(config: Config, workdir: Path, sensor: sts.Sensor) -> dataset.Dataset:
-    """Simulate and render what is missing of the dataset, and open it. `objects.txt` lists objects left out."""
-    claim(config, workdir)
+def collect(collection: dataset.Collection, sensor: sts.Sensor, folder: Path) -> dataset.Dataset:
+    """Simulate and render what is missing of a dataset, and open it."""
     with Bar() as bar:
         collected = dataset.collect(
-            config.collection,
-            sensor,
-            workdir / "dataset",
-            progress=lambda p: bar(f"collect: {p.stage}", p.done, p.total),
+            collection, sensor, folder, progress=lambda p: bar(f"collect: {p.stage}", p.done, p.total)
         )
-    left_out = [f"collect: left out {line}" for line in collected.left_out]
-    for line in left_out:
-        say(line)
-    append(workdir / "objects.txt", left_out)
+    for line in collected.left_out:
+        say(f"collect: left out {line}")
     if collected.resampled:
-        say(
-            f"collect: {collected.resampled} trajectories had non-finite values or sank into the pad and were drawn "
-            "again"
-        )
-    return dataset.load(workdir / "dataset")
-
-
-def append(path: Path, lines: Sequence[str]) -> None:
-    """Append lines to a text file, except lines that the file contains already."""
-    before = path.read_text(errors="replace") if path.exists() else ""
-    new = "".join(f"{line}\n" for line in lines if f"{line}\n" not in before)
-    if new:
-        storage.write_bytes(path, (before + new).encode())
-
-
-def _collected(config: Config, workdir: Path) -> dataset.Dataset:
-    """Open the dataset of an earlier run."""
-    claim(config, workdir)
-    if not (workdir / "dataset" / "collection.json").exists():
-        raise FileNotFoundError(
-            f"{workdir / 'dataset'} is not a collected dataset: first run the command with `--only collect`"
-        )
-    return dataset.load(workdir / "dataset")
-
-
-def _check_trained(run: Run) -> None:
-    for name in MODELS[run.config.model]:
-        if not (run.folder(name) / "config.json").exists():
-            raise FileNotFoundError(
-                f"{run.folder(name)} is not a trained model: first run the command with `--only train`"
-            )
+        say(f"collect: {collected.resampled} trajectories with non-finite values or in the pad were drawn again")
+    return dataset.load(folder)
 
 
 class Job(NamedTuple):
@@ -266,14 +201,8 @@ def jobs(
         schedule = config.training
         if config.steps is not None:
             schedule = dataclasses.replace(schedule, steps=config.steps[number])
-        yield Job(
-            name,
-            schedule,
-            training.paper_model(modalities, preprocessing, measurements=further),
-            arrays,
-            preprocessing,
-            empty,
-        )
+        model = training.paper_model(modalities, preprocessing, measurements=further)
+        yield Job(name, schedule, model, arrays, preprocessing, empty)
 
 
 def train(run: Run, data: dataset.Dataset, own: Extensions = NONE) -> None:
@@ -293,9 +222,8 @@ def train(run: Run, data: dataset.Dataset, own: Extensions = NONE) -> None:
         train_model(job, folder, config.targets, own)
         if isinstance(job.model, statespace.Config):
             validation, scenario = data.pairs(rows["validation"]), config.collection.scenario
-            training.calibrate(
-                folder, training.state_arrays(validation, job.model, scenario, job.preprocessing, job.empty)
-            )
+            arrays = training.state_arrays(validation, job.model, scenario, job.preprocessing, job.empty)
+            training.calibrate(folder, arrays)
 
 
 def train_model(
@@ -323,6 +251,6 @@ def train_model(
             loss=None if own.loss is None else own.loss(job.model),
             optimiser=own.optimiser,
             notes=own.notes,
-            progress=show if progress is None else progress,
+            progress=progress or show,
             log=None if own.log is None else own.log(job.name),
         )

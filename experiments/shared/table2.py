@@ -12,7 +12,7 @@ import sts_jax as sts
 from experiments.shared.collecting import Collect, simulate
 from experiments.shared.config import MODELS, TITLES
 from experiments.shared.evaluate import identity, record, stale
-from experiments.shared.run import Folder, Job, Stage, train_model
+from experiments.shared.run import Job, Stage, train_model
 from experiments.shared.terminal import Bar, say
 from sts_jax import evaluation, hardware, storage, training
 from sts_jax.evaluation import Predicted
@@ -56,7 +56,7 @@ class Train:
 
     # configuration of the preset. Each of its fields is an option
     config: Annotated[Config, tyro.conf.arg(name="")]
-    workdir: Folder = Path("runs/real")  # work directory with the folder `dataset` and the sensor file `sensor.json`
+    workdir: Path = Path("runs/real")  # work directory with the folder `dataset` and the sensor file `sensor.json`
     name: str = "table2"  # folder in the work directory for the results
     preset: Literal["smoke", "default", "paper"] = "default"  # set of default values for the options
     only: Stage | None = None  # run only this stage of the experiment
