@@ -4,16 +4,11 @@
         --simulated runs/twin/dataset --simulated-sensor runs/twin
     python -m experiments.gap --real runs/real/dataset --sensor bench --simulated runs/released/dataset --match none
 
-`--real` is a folder of trajectories that `experiments.real collect` recorded with a sensor. `--simulated` is a folder
-that `experiments.real collect --twin` recorded with the digital twin, or the dataset of an experiment that was run with
-`--collection.no-crop`. `--sensor` and `--simulated-sensor` are the sensor files of the real sensor and of the twin,
-with whose lenses the raw images are rectified. By default, a real and a simulated trajectory with the same number must
-show the same object in the same poses. Give `--match none` if the two folders show the same object in different poses.
-
-The command prints the distance between the distributions of real and simulated images in a feature space, and the
-accuracy of a classifier that tries to distinguish real from simulated images. With `--match number`, the default, it
-also prints differences per pixel. The text and a figure of the images go to the folder `--out`. The command takes about
-a minute for 40 trajectories. The classifier needs scikit-learn (`pip install -e '.[bench]'`).
+`--simulated` is a session of the twin, or the dataset of an experiment that was run with `--collection.no-crop`. By
+default, a real and a simulated trajectory with the same number must show the same object in the same poses. Give
+`--match none` if the two folders show the same object in different poses. The measures are described in
+`docs/hardware/gap.md`. The text and a figure of the images go to the folder `--out`. The classifier needs scikit-learn
+(`pip install -e '.[bench]'`).
 """
 
 import dataclasses
@@ -53,41 +48,22 @@ class Config:
     debug: bool = False  # show the traceback of every error
 
 
-@dataclasses.dataclass(frozen=True)
-class Side:
-    """The real or the simulated images: the initial and the final one of the first trajectory, of the second, ..."""
-
-    images: gap.Streams  # images of both streams, with the number of their trajectory
-    described: str  # description of the source
-
-    @classmethod
-    def of_pairs(cls, visual: np.ndarray, tactile: np.ndarray, numbers: np.ndarray, described: str) -> "Side":
-        """Make a side of initial and final images, shape (n, 2, height, width, 3), of n numbered trajectories."""
-        visual, tactile = (leaf.reshape(-1, *leaf.shape[2:]) for leaf in (visual, tactile))
-        return cls(gap.Streams(visual, tactile, np.repeat(numbers, 2)), f"{described}, {len(numbers)} trajectories")
-
-    def of(self, numbers: np.ndarray) -> "Side":
-        """Select the images whose trajectory number is in `numbers`."""
-        chosen = np.isin(self.images.group, numbers)
-        return dataclasses.replace(self, images=gap.Streams(*(leaf[chosen] for leaf in self.images)))
+def streams(visual: np.ndarray, tactile: np.ndarray, numbers: np.ndarray) -> gap.Streams:
+    """The initial and the final image of numbered trajectories, from images (n, 2, height, width, 3)."""
+    return gap.Streams(*(leaf.reshape(-1, *leaf.shape[2:]) for leaf in (visual, tactile)), np.repeat(numbers, 2))
 
 
-def session(folder: Path, sensor: Path | None, resolution: tuple[int, int]) -> Side:
+def session(folder: Path, sensor: Path | None, resolution: tuple[int, int]) -> gap.Streams:
     """Read the images of a session, and rectify them with the lens of a sensor file, unless there is none."""
     recordings = hardware.load_recordings(folder)
-    size = f"{resolution[0]} x {resolution[1]}"
     if sensor is None:
-        described = f"taken as rectified, reduced to {size}"
-        images = recordings.images(lambda image: centred(image, resolution))
-    else:
-        lens = hardware.Device.load(sensor).lens
-        pinhole = sts.Sensor.load(hardware.sensor_file.sensor_file(sensor)).camera
-        described = f"rectified with the lens of {sensor} to {size}"
-        images = recordings.images(lambda image: hardware.rectified(lens, pinhole, image, resolution))
-    return Side.of_pairs(images.visual, images.tactile, images.number, f"{folder}, {described}")
+        return streams(*recordings.images(lambda image: centred(image, resolution)))
+    lens = hardware.Device.load(sensor).lens
+    pinhole = sts.Sensor.load(hardware.sensor_file.sensor_file(sensor)).camera
+    return streams(*recordings.images(lambda image: hardware.rectified(lens, pinhole, image, resolution)))
 
 
-def simulated_dataset(folder: Path, resolution: tuple[int, int] | None) -> Side:
+def simulated_dataset(folder: Path, resolution: tuple[int, int] | None) -> gap.Streams:
     """Read the first and the last frame of each rendered trajectory of a dataset."""
     data = dataset.load(folder)
     if data.collection["crop"]:
@@ -98,8 +74,7 @@ def simulated_dataset(folder: Path, resolution: tuple[int, int] | None) -> Side:
             f"--resolution is {resolution}, but the images of {folder} have the size {size}: leave out --resolution"
         )
     pairs = data.pairs(data.rendered())
-    described = f"{folder}, a dataset of {size[0]} x {size[1]}"
-    return Side.of_pairs(pairs.visual, pairs.tactile, pairs.trajectory, described)
+    return streams(pairs.visual, pairs.tactile, pairs.trajectory)
 
 
 def centred(image: np.ndarray, resolution: tuple[int, int]) -> np.ndarray:
@@ -112,39 +87,46 @@ def centred(image: np.ndarray, resolution: tuple[int, int]) -> np.ndarray:
     return cv2.resize(part, (columns, rows), interpolation=cv2.INTER_AREA)
 
 
-def load(config: Config) -> tuple[Side, Side]:
+def chosen(images: gap.Streams, numbers: np.ndarray) -> gap.Streams:
+    """Select the images whose trajectory number is in `numbers`."""
+    rows = np.isin(images.group, numbers)
+    return gap.Streams(*(leaf[rows] for leaf in images))
+
+
+def load(config: Config) -> tuple[gap.Streams, gap.Streams]:
     """Read both sides. With `--match number`, they have the same trajectory numbers, otherwise none in common."""
-    is_dataset = (config.simulated / "collection.json").exists()
-    if is_dataset and config.match == "number":
-        raise ValueError(f"{config.simulated} is a dataset, whose numbers match no real ones: give --match none")
-    if is_dataset and config.simulated_sensor is not None:
-        raise ValueError(f"{config.simulated} is a dataset, whose images are rectified: leave out --simulated-sensor")
-    if config.resolution is not None and min(config.resolution) < gap.LEAST_SIDE:
-        raise ValueError(
-            f"--resolution must be at least {gap.LEAST_SIDE} x {gap.LEAST_SIDE} pixels, got {config.resolution}"
-        )
-    if is_dataset:
+    if (config.simulated / "collection.json").exists():
+        if config.match == "number" or config.simulated_sensor is not None:
+            raise ValueError(
+                f"{config.simulated} is a dataset, whose images are rectified and whose numbers match no real ones: "
+                "give --match none, and leave out --simulated-sensor"
+            )
         simulated = simulated_dataset(config.simulated, config.resolution)
     else:
         simulated = session(config.simulated, config.simulated_sensor, config.resolution or (240, 320))
-    height, width = simulated.images.visual.shape[1:3]
+    height, width = simulated.visual.shape[1:3]
+    if min(height, width) < gap.LEAST_SIDE:
+        raise ValueError(f"--resolution must be at least {gap.LEAST_SIDE} x {gap.LEAST_SIDE}, got {(height, width)}")
     real = session(config.real, config.sensor, (height, width))
     if config.match == "none":
-        others = simulated.images._replace(group=simulated.images.group + real.images.group.max() + 1)
-        return real, dataclasses.replace(simulated, images=others)
-    common = np.intersect1d(real.images.group, simulated.images.group)
+        return real, simulated._replace(group=simulated.group + real.group.max() + 1)
+    common = np.intersect1d(real.group, simulated.group)
     if not len(common):
         raise ValueError(f"{config.real} and {config.simulated} have no trajectory number in common: give --match none")
-    return real.of(common), simulated.of(common)
+    return chosen(real, common), chosen(simulated, common)
 
 
-def report(real: Side, simulated: Side, *, matched: bool) -> str:
+def report(config: Config, real: gap.Streams, simulated: gap.Streams) -> str:
     """The text that the command prints: the sources of the images, and a table of the measured differences."""
-    number = len(np.unique(real.images.group))
-    head = f"matched by number: {number} trajectories" if matched else "not matched"
-    lines = [f"real:      {real.described}", f"simulated: {simulated.described}", head, ""]
-    lines.append(f"{'':42s}{'visual':26s}{'tactile':26s}".rstrip())
-    columns = [measured(real.images, simulated.images, stream, matched=matched) for stream in STREAMS]
+    height, width = real.visual.shape[1:3]
+    sides = (config.real, config.sensor, real), (config.simulated, config.simulated_sensor, simulated)
+    lines = [
+        f"{folder}{f' with the lens of {sensor}' if sensor else ''}: {len(np.unique(images.group))} trajectories"
+        for folder, sensor, images in sides
+    ]
+    matching = "matched by number" if config.match == "number" else "not matched"
+    lines += [f"{matching}, compared at {height} x {width}", "", f"{'':42s}{'visual':26s}tactile"]
+    columns = [measured(real, simulated, stream, matched=config.match == "number") for stream in STREAMS]
     for name in columns[0]:
         lines.append(f"{name:42s}{''.join(f'{column[name]:26s}' for column in columns)}".rstrip())
     return "\n".join([*lines, "", "In brackets: 95 % interval over trajectories (bootstrap)."])
@@ -152,18 +134,24 @@ def report(real: Side, simulated: Side, *, matched: bool) -> str:
 
 def measured(real: gap.Streams, simulated: gap.Streams, stream: str, *, matched: bool) -> dict[str, str]:
     """Compare the real with the simulated images of one stream: formatted values by the names of the metrics."""
+
+    def written(estimate: gap.Estimate, digits: int) -> str:
+        return f"{estimate.value:.{digits}f} [{estimate.low:.{digits}f}, {estimate.high:.{digits}f}]"
+
     first, second = getattr(real, stream), getattr(simulated, stream)
     rows = {}
     if matched:
         errors = gap.pixel_errors(first, second, real.group)
-        rows["mean absolute error (of 255)"] = written(errors.mae, 2)
-        rows["root mean squared error (of 255)"] = written(errors.rmse, 2)
-        rows["PSNR (dB)"] = written(errors.psnr, 1)
-        rows["SSIM"] = written(errors.ssim, 3)
         # A shift by two images pairs each image with the same end of another trajectory.
         other = gap.pixel_errors(first, np.roll(second, 2, axis=0), real.group)
-        rows["  same, for another trajectory: MAE"] = written(other.mae, 2)
-        rows["  same, for another trajectory: SSIM"] = written(other.ssim, 3)
+        rows = {
+            "mean absolute error (of 255)": written(errors.mae, 2),
+            "root mean squared error (of 255)": written(errors.rmse, 2),
+            "PSNR (dB)": written(errors.psnr, 1),
+            "SSIM": written(errors.ssim, 3),
+            "  same, for another trajectory: MAE": written(other.mae, 2),
+            "  same, for another trajectory: SSIM": written(other.ssim, 3),
+        }
     one, two = gap.features(first), gap.features(second)
     energy = gap.energy_distance(one, two, real.group, simulated.group)
     rows["energy distance (0: equal, 1: far apart)"] = f"{energy.value:.3f} (p = {energy.p:.3f})"
@@ -171,20 +159,14 @@ def measured(real: gap.Streams, simulated: gap.Streams, stream: str, *, matched:
     return rows
 
 
-def written(estimate: gap.Estimate, digits: int) -> str:
-    """Format an estimate and the limits of its 95 % interval as text."""
-    return f"{estimate.value:.{digits}f} [{estimate.low:.{digits}f}, {estimate.high:.{digits}f}]"
-
-
-def draw(config: Config, real: Side, simulated: Side, *, matched: bool) -> None:
+def draw(config: Config, real: gap.Streams, simulated: gap.Streams) -> None:
     """Draw the real and the simulated images of the first `config.rows` trajectories into `gap.png`."""
-    numbers = np.unique(real.images.group)[: config.rows]
-    others = numbers if matched else np.unique(simulated.images.group)[: config.rows]
-    shown = min(len(numbers), len(others))
-    first, second = real.of(numbers[:shown]).images, simulated.of(others[:shown]).images
+    numbers, others = (np.unique(side.group)[: config.rows] for side in (real, simulated))
+    shown, matched = min(len(numbers), len(others)), config.match == "number"
     heads = [f"#{number}" if matched else "draw" for number in numbers[:shown]]
     labels = [f"{head}\n{end}" for head in heads for end in ("initial", "final")]
     title = "the same object in the same poses" if matched else "draws of both sides, in other poses"
+    first, second = chosen(real, numbers[:shown]), chosen(simulated, others[:shown])
     path = config.out / "gap.png"
     figures.side_by_side(path, first, second, labels, matched=matched, title=title, names=config.names)
 
@@ -195,11 +177,10 @@ def main(config: Config) -> None:
         raise ValueError(f"--rows must be >= 1, got {config.rows}")
     drawing.make_folder(config.out)
     real, simulated = load(config)
-    matched = config.match == "number"
-    text = report(real, simulated, matched=matched)
+    text = report(config, real, simulated)
     print(text)
     storage.write_bytes(config.out / "gap.txt", f"{text}\n".encode())
-    draw(config, real, simulated, matched=matched)
+    draw(config, real, simulated)
 
 
 if __name__ == "__main__":

@@ -2,14 +2,10 @@
 
     python -m experiments.objects --out sheet.png --seed 0 --num 10
 
-The command takes about half a minute on two CPU cores for 8 x 10 objects. `--view side` shows the objects as a person
-sees them, and `--view below` shows the objects as the sensor sees them. `--shuffle` draws the objects in random order
-without names, so that other people can try to recognise them.
-
-A line is printed for each object: its size, its number of faces, the number of vertices of its collision hull, and two
-gaps. The first gap is the largest distance by which the surface lies outside the hull. The second gap is the largest
-distance by which the hull lies outside the surface. With `--parts`, each object whose hull fits badly is decomposed
-into convex parts before its gaps are measured. This takes about ten seconds per object.
+`--view below` shows the objects as the sensor sees them. `--shuffle` draws the objects in random order without names, so
+that other people can try to recognise them. A line is printed for each object: its size, its number of faces, the
+number of vertices of its collision hull, and the largest distances by which the surface lies outside the hull and the
+hull outside the surface. With `--parts`, each object whose hull fits badly is first decomposed into convex parts.
 """
 
 import dataclasses
@@ -59,17 +55,8 @@ def portrait(body: sts.objects.Body, direction: jax.Array, *, size: int) -> jax.
     direction = direction + jnp.where(flat, jnp.array([0.0, 0.0, 0.5]), jnp.zeros(3))
     middle = (jnp.max(body.vertices, 0) + jnp.min(body.vertices, 0)) / 2
     eye = middle + DISTANCE * direction / jnp.linalg.norm(direction)
-    return optics.photograph(
-        body.vertices,
-        body.faces,
-        body.normals,
-        body.colors,
-        eye=eye,
-        target=middle,
-        fov=FIELD,
-        resolution=(size, size),
-        two_sided=body.two_sided,
-    )
+    mesh, view = (body.vertices, body.faces, body.normals, body.colors), {"eye": eye, "target": middle, "fov": FIELD}
+    return optics.photograph(*mesh, **view, resolution=(size, size), two_sided=body.two_sided)
 
 
 def describe(category: str, number: int, body: sts.objects.Body, *, parts: bool) -> str:
@@ -88,11 +75,11 @@ def main(config: Config) -> None:
     families = {category: sts.objects.find_family(category) for category in config.categories}
     drawing.check_picture(config.out)
     key = jax.random.key(config.seed)
-    drawn = []
-    for category, family in families.items():
-        for number in range(config.num):
-            object_key = jax.random.fold_in(jax.random.fold_in(key, family.seed), number)
-            drawn.append((category, sts.objects.make(object_key, category)))
+    drawn = [
+        (category, sts.objects.make(jax.random.fold_in(jax.random.fold_in(key, family.seed), number), category))
+        for category, family in families.items()
+        for number in range(config.num)
+    ]
     if config.shuffle:
         order = np.asarray(jax.random.permutation(key, len(drawn)))
         drawn = [drawn[i] for i in order]

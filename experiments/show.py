@@ -8,7 +8,7 @@ experiment of the scenario. `--seed` is the seed of the objects and the trajecto
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +29,7 @@ SCENARIOS = {
 class Config:
     """Options of the command line: scenario, number of trajectories, seed, folder of the pictures, and image size."""
 
-    scenario: Annotated[str, tyro.conf.Positional]  # name of the scenario: freefall, inclined, perturbed or released
+    scenario: Annotated[Literal["freefall", "inclined", "perturbed", "released"], tyro.conf.Positional]
     num: int = 4  # number of trajectories, each with another object
     seed: int = 0  # seed of the objects and the trajectories
     out: Path = Path("show")  # folder for the pictures
@@ -38,10 +38,6 @@ class Config:
 
 def main(config: Config) -> None:
     """Simulate the trajectories, render them from outside and through the sensor, and draw them."""
-    if config.scenario not in SCENARIOS:
-        raise ValueError(f"scenario is {config.scenario!r}, but it must be one of {', '.join(SCENARIOS)}")
-    if config.num < 1:
-        raise ValueError(f"--num is {config.num}, but it must be at least 1")
     drawing.make_folder(config.out)
     sensor = sts.Sensor()
     collection = dataclasses.replace(SCENARIOS[config.scenario], num_objects=config.num, seed=config.seed)
@@ -49,30 +45,16 @@ def main(config: Config) -> None:
     trajectories = sts.physics.simulate(jax.random.key(config.seed), bodies, sensor, collection.scenario)
     for i, (name, body) in enumerate(zip(names, bodies, strict=True)):
         one = jax.tree.map(lambda x, i=i: np.asarray(x[i]), trajectories)
-        seen = dataset.render_uint8(
-            sensor,
-            body,
-            jnp.asarray(one.pose),
-            jnp.asarray(one.wrench),
-            resolution=(config.size, config.size),
-            crop=False,
-        )
+        motion, size = (jnp.asarray(one.pose), jnp.asarray(one.wrench)), (config.size, config.size)
+        seen = dataset.render_uint8(sensor, body, *motion, resolution=size, crop=False)
         visual, tactile = (np.asarray(stream) / 255 for stream in seen[:2])
         view = drawing.views(body, one.pose, one.gravity, sensor, collection.scenario.wall)
         words = drawing.describe(collection.scenario, name, one._asdict(), one.hidden._asdict())
         path = config.out / f"{config.scenario}-{i}.png"
-        evaluation.figures.strip(path, one.time, view, visual, tactile, one.wrench, title=words)
-        evaluation.figures.animation(
-            path.with_suffix(".gif"),
-            one.time,
-            view,
-            visual,
-            tactile,
-            one.wrench,
-            one.gravity,
-            title=words,
-            outcome=collection.scenario.named(int(one.outcome)),
-        )
+        shown = one.time, view, visual, tactile, one.wrench
+        evaluation.figures.strip(path, *shown, title=words)
+        outcome = collection.scenario.named(int(one.outcome))
+        evaluation.figures.animation(path.with_suffix(".gif"), *shown, one.gravity, title=words, outcome=outcome)
         print(f"{path.with_suffix('')}: {words}")
 
 

@@ -359,8 +359,9 @@ def test_results_that_are_missing_or_changed_are_stale_until_they_are_written_ag
     if content is not None:
         (evaluated / name).write_bytes(content)
     assert re.search(reason, evaluate.stale(evaluated, "evaluation", INPUTS))
+    (evaluated / "table.md").write_bytes(b"table.md")
     (evaluated / "figures" / "a.png").write_bytes(b"new")
-    evaluate.record(evaluated, "evaluation", INPUTS, [evaluated / "figures" / "a.png"])
+    evaluate.record(evaluated, "evaluation", INPUTS, [evaluated / "table.md", evaluated / "figures" / "a.png"])
     assert evaluate.stale(evaluated, "evaluation", INPUTS) is None
 
 

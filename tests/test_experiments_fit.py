@@ -28,7 +28,7 @@ def seven(tmp_path):
 
 def starts(text):
     """Errors at the beginning (mm, mm, degrees) and at the end (mm, degrees) of each start."""
-    line = r"start \d: (\S+), (\S+) mm, (\S+) degrees off; end: (\S+) mm, (\S+) degrees off, loss \S+; \d+ s\n"
+    line = r"start \d: (\S+), (\S+) mm, (\S+) degrees off; end: (\S+) mm, (\S+) degrees off, loss \S+\n"
     return np.array(re.findall(line, text), float)
 
 

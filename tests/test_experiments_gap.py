@@ -51,11 +51,11 @@ def test_equal_sessions_have_no_gap(folder, tmp_path, capsys):
 def test_trajectories_are_matched_by_their_number(folder, tmp_path):
     other = write(tmp_path / "other", (1, 2, 4, 5, 6, 9))
     real, simulated = command.load(config(folder, other, tmp_path))
-    assert list(real.images.group) == [1, 1, 2, 2, 4, 4, 5, 5, 6, 6]
+    assert list(real.group) == [1, 1, 2, 2, 4, 4, 5, 5, 6, 6]
     for stream in ("visual", "tactile"):
         np.testing.assert_array_equal(getattr(real.images, stream), getattr(simulated.images, stream))
-    np.testing.assert_array_equal(real.images.visual[2], pair(2, "initial", SIZE).visual.image)
-    np.testing.assert_array_equal(real.images.tactile[3], pair(2, "final", SIZE).tactile.image)
+    np.testing.assert_array_equal(real.visual[2], pair(2, "initial", SIZE).visual.image)
+    np.testing.assert_array_equal(real.tactile[3], pair(2, "final", SIZE).tactile.image)
 
 
 def test_sides_without_a_match_share_no_group(folder, tmp_path, capsys):
@@ -64,7 +64,7 @@ def test_sides_without_a_match_share_no_group(folder, tmp_path, capsys):
     assert "not matched" in printed
     assert "absolute" not in printed
     real, simulated = command.load(config(folder, tmp_path / "other", tmp_path, match="none"))
-    assert not set(real.images.group) & set(simulated.images.group)
+    assert not set(real.group) & set(simulated.group)
 
 
 def test_raw_images_are_rectified_with_the_lens_of_the_sensor_file(folder, tmp_path):
@@ -73,8 +73,8 @@ def test_raw_images_are_rectified_with_the_lens_of_the_sensor_file(folder, tmp_p
     device.save(tmp_path, sts.Sensor())
     real, simulated = command.load(config(folder, folder, tmp_path, sensor=tmp_path))
     raw = pair(3, "final", SIZE).tactile.image
-    np.testing.assert_array_equal(real.images.tactile[7], hardware.rectified(lens, sts.Sensor().camera, raw, SIZE))
-    np.testing.assert_array_equal(simulated.images.tactile[7], raw)
+    np.testing.assert_array_equal(real.tactile[7], hardware.rectified(lens, sts.Sensor().camera, raw, SIZE))
+    np.testing.assert_array_equal(simulated.tactile[7], raw)
 
 
 def test_a_rectified_image_is_reduced_to_its_centre():
@@ -107,11 +107,11 @@ def test_a_dataset_is_compared_without_a_match_at_its_own_resolution(folder, tmp
     dataset.collect(collection, sts.Sensor(), tmp_path / "made")
     options = command.Config(folder, tmp_path / "made", match="none", out=tmp_path / "out")
     real, simulated = command.load(options)
-    assert real.images.visual.shape == (14, 64, 64, 3)
+    assert real.visual.shape == (14, 64, 64, 3)
     pairs = dataset.load(tmp_path / "made").pairs(np.array([2]))
-    np.testing.assert_array_equal(simulated.images.visual[4:6], pairs.visual[0])
-    np.testing.assert_array_equal(simulated.images.tactile[4:6], pairs.tactile[0])
+    np.testing.assert_array_equal(simulated.visual[4:6], pairs.visual[0])
+    np.testing.assert_array_equal(simulated.tactile[4:6], pairs.tactile[0])
     command.main(options)
-    assert "a dataset of 64 x 64, 5 trajectories" in capsys.readouterr().out
+    assert "not matched, compared at 64 x 64" in capsys.readouterr().out
     with pytest.raises(ValueError, match=r"resolution is \(96, 128\), but the images of .* have the size \(64, 64\)"):
         command.load(dataclasses.replace(options, resolution=SIZE))

@@ -155,11 +155,6 @@ def test_show_writes_a_strip_and_an_animation(name, scenario, tmp_path, monkeypa
     assert red(later) > 50 + (red(first) if name == "perturbed" else 0)
 
 
-def test_an_unknown_scenario_cannot_be_shown(tmp_path):
-    with pytest.raises(ValueError, match="must be one of freefall, inclined, perturbed"):
-        show.main(show.Config("sideways", out=tmp_path))
-
-
 @pytest.fixture
 def tiny_preset(monkeypatch):
     """The run of this file as a preset that benchmarks know."""

@@ -63,10 +63,10 @@ def test_missing_trajectories_and_sensor_files_are_errors_with_a_remedy(tmp_path
     with pytest.raises(ValueError, match="must be >= 5, got 3: collect more"):
         table2.read(TINY, tmp_path / "few")
     record(tmp_path / "bare", 5, sensor_file=False)
-    with pytest.raises(FileNotFoundError, match=r"sensor.json is missing.*experiments.commission"):
+    with pytest.raises(FileNotFoundError, match=r"sensor\.json"):
         table2.read(TINY, tmp_path / "bare")
     hardware.Device.load(tmp_path / "few").save(tmp_path / "bare", sts.Sensor())
-    with pytest.raises(ValueError, match="has no images of the empty pad"):
+    with pytest.raises(ValueError, match=r"has no images of the empty pad.*experiments\.commission"):
         table2.read(TINY, tmp_path / "bare")
 
 

@@ -102,23 +102,14 @@ def test_an_experiment_trains_and_scores_a_further_modality(tmp_path):
     assert predictors["MVAE with pose, from force"]["force_error"]["value"] > 0
     assert predictors["VAE visual only, from visual"]["force_error"] is None
     assert "force error (N)" in (tmp_path / "table-full.md").read_text()
-    with pytest.raises(ValueError, match=r"names in measurements are .*mvae was trained with \['force'\]"):
+    with pytest.raises(ValueError, match=r"contains 'force', but `test\.measurements` does not"):
         run.main(config, tmp_path, only="evaluate")
 
 
 FORCE = dataset.Measurement("force", (3,), lambda data, rows: None)
-HEIGHT = evaluation.Metric("height", lambda predicted, test: None)
 
 
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"measurements": (FORCE,)}, "measurements must be empty for model='statespace', got the modality 'force'"),
-        ({"metrics": (HEIGHT, HEIGHT)}, "metrics has more than one metric named 'height'"),
-        ({"columns": (evaluation.Column("h", (HEIGHT,)),)}, r"'h' has the metric 'height', which is not among "),
-    ],
-)
-def test_wrong_extensions_are_refused_before_anything_is_collected(tmp_path, fields, message):
-    with pytest.raises(ValueError, match=message):
-        run.main(freefall.SMOKE, tmp_path / "run", own=Extensions(**fields))
+def test_a_modality_that_the_model_cannot_have_is_refused_before_anything_is_collected(tmp_path):
+    with pytest.raises(ValueError, match="measurements must be empty for model='statespace', got the modality 'force'"):
+        run.main(freefall.SMOKE, tmp_path / "run", own=Extensions(measurements=(FORCE,)))
     assert not (tmp_path / "run").exists()

@@ -155,19 +155,6 @@ class Extensions:
     # Further modalities of the paper's model with all modalities (`--model paper`). Their errors are further metrics
     measurements: tuple[dataset.Measurement, ...] = ()
 
-    def __post_init__(self) -> None:
-        names = [metric.name for metric in self.scored]
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f"metrics has more than one metric named {name!r}: give each metric its own name")
-        for column in self.columns:
-            for metric in column.metrics:
-                if metric.name not in names:
-                    raise ValueError(
-                        f"the column {column.heading!r} has the metric {metric.name!r}, which is not among `metrics` "
-                        f"({', '.join(map(repr, names))}): add it, or leave out the column"
-                    )
-
     @property
     def scored(self) -> tuple[evaluation.Metric, ...]:
         """All metrics: those of the field `metrics`, and the error of each modality in `measurements`."""

@@ -13,7 +13,6 @@ from experiments.shared import drawing
 from experiments.shared.config import MODELS, NONE, TITLES, Extensions, Run
 from experiments.shared.terminal import Bar, say
 from sts_jax import dataset, evaluation, storage, training
-from sts_jax.dataset.measurement import NAMES
 
 # The main table has rows for the main model with the first five of these inputs that the model supports.
 MAIN_SUBSETS = (
@@ -32,10 +31,10 @@ def stale(folder: Path, part: str, inputs: Mapping[str, str]) -> str | None:
         if manifest is None or part not in manifest.facts:
             return f"{storage.MANIFEST} has no record of the {part}"
         recorded = manifest.facts[part]
-        for name in {**recorded["inputs"], **inputs}:
-            if recorded["inputs"].get(name) != inputs.get(name):
+        for name in {**recorded, **inputs}:
+            if recorded.get(name) != inputs.get(name):
                 return f"{name} has changed since"
-        storage.verify(folder, manifest, "it will be written again", recorded["files"])
+        storage.verify(folder, manifest, "it will be written again")
     except storage.DamagedFileError as error:
         return str(error)
     return None
@@ -44,14 +43,11 @@ def stale(folder: Path, part: str, inputs: Mapping[str, str]) -> str | None:
 def record(folder: Path, part: str, inputs: Mapping[str, str], files: Sequence[Path]) -> None:
     """Add the inputs and the files of a part of the results to the manifest of a folder. Call it after writing them."""
     try:
-        before = storage.read_manifest(folder, "")
+        before = storage.read_manifest(folder, "") or storage.Manifest({}, {})
     except storage.DamagedFileError:
-        before = None
-    sums, facts = ({}, {}) if before is None else (before.files, before.facts)
-    names = [file.relative_to(folder).as_posix() for file in files]
-    others = {name: sums[name] for other in facts if other != part for name in facts[other]["files"]}
-    facts = {**facts, part: {"inputs": dict(inputs), "files": names}}
-    storage.write_manifest(folder, {**others, **storage.checksums(folder, names)}, facts)
+        before = storage.Manifest({}, {})
+    sums = storage.checksums(folder, [file.relative_to(folder).as_posix() for file in files])
+    storage.write_manifest(folder, {**before.files, **sums}, {**before.facts, part: dict(inputs)})
 
 
 def identity(model: Path) -> str:
@@ -87,7 +83,6 @@ def evaluate(run: Run, data: dataset.Dataset, own: Extensions = NONE) -> str:
         return table.read_text()
     if metrics.exists() or table.exists():
         say(f"evaluate: again, because {reason}")
-    _check_measurements(run.folder(run.main_model), own)
     pairs = _pairs(run, data, own)
     test, judge = pairs.test, evaluation.scorer(scenario, pairs.train, metrics=own.scored)
     with Bar() as bar:
@@ -128,17 +123,6 @@ def _inputs(run: Run, data: dataset.Dataset, own: Extensions) -> dict[str, str]:
     if own.described() != NONE.described():
         inputs["the list of metrics"] = storage.digest(own.described())
     return inputs
-
-
-def _check_measurements(folder: Path, own: Extensions) -> None:
-    """Raise a `ValueError` unless `own.measurements` has the further modalities of the model in a folder."""
-    trained = sorted(set(sts.Predictor.load(folder).modalities) - set(NAMES))
-    given = sorted(measurement.name for measurement in own.measurements)
-    if given != trained:
-        raise ValueError(
-            f"the names in measurements are {given}, but the model in {folder} was trained with {trained}: pass the "
-            "same Extensions(measurements=...) as for the training"
-        )
 
 
 def _pairs(run: Run, data: dataset.Dataset, own: Extensions) -> SplitPairs:

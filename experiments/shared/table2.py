@@ -75,17 +75,15 @@ class Recorded(NamedTuple):
 
 def main(args: Train) -> None:
     """Collect trajectories of the digital twin if there are too few, train, evaluate, and print the table."""
-    config, workdir = args.config, args.workdir
+    config, workdir, folder = args.config, args.workdir, args.workdir / args.name
     check(config)
-    if args.name != Path(args.name).name or args.name in ("", "dataset"):
-        raise ValueError(f"--name must be the name of a folder, not a path and not 'dataset', got {args.name!r}")
     sts.enable_compilation_cache()
     if args.only in (None, "collect") and (count := missing(config, workdir)):
         say(f"collect: {count} trajectories of the digital twin into {workdir / 'dataset'}")
         simulate(Collect(workdir, twin=True, count=config.count, size=config.size))
     if args.only == "collect":
         return
-    data, folder = read(config, workdir), workdir / args.name
+    data = read(config, workdir)
     with storage.lock(folder):
         storage.claim(folder / "config.json", {**dataclasses.asdict(config), "trajectories": data.identity})
         if args.only in (None, "train"):
@@ -99,15 +97,11 @@ def check(config: Config) -> None:
     """Check the fields of the configuration before any work."""
     if not 0 < config.held_out < 1:
         raise ValueError(f"held_out must be a share above 0 and below 1, got {config.held_out}")
-    if config.shifts < 0 or not 0 <= config.largest_shift < config.image_size:
-        raise ValueError(
-            f"shifts must be >= 0 and largest_shift 0 to {config.image_size - 1} pixels, got {config.shifts} and "
-            f"{config.largest_shift}"
-        )
-    if config.count < LEAST:
-        raise ValueError(f"count must be >= {LEAST}, got {config.count}")
-    if config.num_shown < 1:
-        raise ValueError(f"num_shown must be >= 1, got {config.num_shown}")
+    for name, least in (("count", LEAST), ("num_shown", 1), ("shifts", 0)):
+        if getattr(config, name) < least:
+            raise ValueError(f"{name} must be >= {least}, got {getattr(config, name)}")
+    if not 0 <= config.largest_shift < config.image_size:
+        raise ValueError(f"largest_shift must be 0 to {config.image_size - 1} pixels, got {config.largest_shift}")
     # This raises an error if no network exists for images of this size.
     training.paper_model(("visual",), training.Preprocessing((config.image_size, config.image_size)))
 
@@ -123,22 +117,24 @@ def missing(config: Config, workdir: Path) -> int:
 def read(config: Config, workdir: Path) -> Recorded:
     """Read the confirmed trajectories of a work directory, rectify the images, and hold out validation trajectories."""
     recordings = hardware.load_recordings(workdir / "dataset")
-    device, sensor, backgrounds = sensor_file(workdir)
     if len(recordings) < LEAST:
         raise ValueError(
             f"the number of confirmed trajectories in {recordings.folder} must be >= {LEAST}, got {len(recordings)}: "
             "collect more, or confirm existing ones with `python -m experiments.real review --confirm NUMBER`"
         )
-    size = (config.image_size, config.image_size)
-    with Bar() as bar:
-        images = recordings.images(
-            lambda image: hardware.rectified(device.lens, sensor.camera, image, size),
-            lambda done, total: bar("read", done, total),
+    device, camera = hardware.Device.load(workdir), sts.Sensor.load(workdir / "sensor.json").camera
+    backgrounds = device.backgrounds(workdir)
+    if backgrounds is None:
+        raise ValueError(
+            f"{workdir} has no images of the empty pad, which are needed to find contacts: copy all files that "
+            "`python -m experiments.commission` wrote into the work directory"
         )
-    empty = {
-        stream: hardware.rectified(device.lens, sensor.camera, image, size)
-        for stream, image in zip(("visual", "tactile"), backgrounds, strict=True)
-    }
+
+    def rectified(image: np.ndarray) -> np.ndarray:
+        return hardware.rectified(device.lens, camera, image, (config.image_size, config.image_size))
+
+    with Bar() as bar:
+        images = recordings.images(rectified, lambda done, total: bar("read", done, total))
     order = np.random.default_rng(config.seed).permutation(len(recordings))
     cut = min(max(round((1 - config.held_out) * len(order)), 1), len(order) - 1)
     train, validation = (
@@ -148,24 +144,8 @@ def read(config: Config, workdir: Path) -> Recorded:
     is_twin = recordings.origin.leds.startswith("TWIN")
     source = "a digital twin" if is_twin else f"the sensor {recordings.origin.camera}"
     content = {"dataset": recordings.identity, "sensor": hardware.sensor_file.checksums(workdir)}
+    empty = dict(zip(evaluation.STREAMS, map(rectified, backgrounds), strict=True))
     return Recorded(train, validation, empty, storage.digest(content), source)
-
-
-def sensor_file(workdir: Path) -> tuple[hardware.Device, sts.Sensor, tuple[np.ndarray, np.ndarray]]:
-    """Read the sensor file of a work directory: the device, the constants, and the raw images of the empty pad."""
-    path = workdir / "sensor.json"
-    if not path.exists():
-        raise FileNotFoundError(
-            f"{path} is missing: copy all files that `experiments.commission` wrote into the work directory"
-        )
-    device = hardware.Device.load(path)
-    backgrounds = device.backgrounds(path)
-    if backgrounds is None:
-        raise ValueError(
-            f"{path.parent} has no images of the empty pad, but they are needed to find contacts: run "
-            "`python -m experiments.commission` again, and copy its files into the work directory"
-        )
-    return device, sts.Sensor.load(path), backgrounds
 
 
 def jobs(config: Config, data: Recorded) -> Iterator[Job]:
@@ -229,15 +209,15 @@ def evaluate(config: Config, data: Recorded, workdir: Path, folder: Path) -> str
 
 def predictions(models: Mapping[str, Path], data: Recorded) -> dict[str, Predicted]:
     """Predict the validation trajectories with each model, from each subset of its inputs, by title of the row."""
-    rows = {}
-    first = _unit({stream: getattr(data.validation, stream)[:, 0] for stream in evaluation.STREAMS})
+    rows, first = {}, _held(data)
     for name, path in models.items():
         predictor = sts.Predictor.load(path)
         for given, subset in evaluation.subsets(predictor.modalities).items():
             out = predictor(**{stream: first[stream] for stream in subset})  # type: ignore[arg-type]
             title = TITLES[name] if len(subset) == len(predictor.modalities) else f"{TITLES[name]}, {given} alone"
-            visual, tactile = (None if image is None else np.asarray(image) for image in (out.visual, out.tactile))
-            rows[title] = Predicted(visual, tactile)
+            rows[title] = Predicted(
+                *(None if image is None else np.asarray(image) for image in (out.visual, out.tactile))
+            )
     return rows
 
 
@@ -252,28 +232,30 @@ def transferred(config: Config, data: Recorded, workdir: Path) -> Predicted | No
         return None
     large = read(dataclasses.replace(config, image_size=height), workdir)
     recorded, model = SensorView(**_unit(large.empty)), SensorView(**predictor.empty)
-    streams = _unit({"visual": large.validation.visual[:, 0], "tactile": large.validation.tactile[:, 0]})
-    views = [hardware.relit(SensorView(*pair), recorded, model) for pair in zip(*streams.values(), strict=True)]
-    out = predictor(
-        visual=np.stack([view.visual for view in views]), tactile=np.stack([view.tactile for view in views])
-    )
-    visual, tactile = np.asarray(out.visual), np.asarray(out.tactile)
-    if visual.shape[1:3] != (side, side):
+    views = _relit(SensorView(**_held(large)), recorded, model)
+    out = predictor(visual=views.visual, tactile=views.tactile)
+    if np.shape(out.visual)[1:3] != (side, side):
         return None
-    recorded, model = SensorView(**_unit(data.empty)), SensorView(*(_reduced(image, side) for image in model))
-    back = [hardware.relit(SensorView(*pair), model, recorded) for pair in zip(visual, tactile, strict=True)]
-    return Predicted(np.stack([view.visual for view in back]), np.stack([view.tactile for view in back]))
+    step = height // side
+    small = SensorView(*(image.reshape(side, step, side, step, 3).mean((1, 3)) for image in model))
+    predicted = SensorView(np.asarray(out.visual), np.asarray(out.tactile))
+    return Predicted(*_relit(predicted, small, SensorView(**_unit(data.empty))))
+
+
+def _relit(images: SensorView, given: SensorView, wanted: SensorView) -> SensorView:
+    """Adapt n pairs of images from one sensor to another, which are known by their images of the empty pad."""
+    views = [hardware.relit(SensorView(*pair), given, wanted) for pair in zip(*images, strict=True)]
+    return SensorView(*(np.stack(stream) for stream in zip(*views, strict=True)))
+
+
+def _held(data: Recorded) -> dict[str, np.ndarray]:
+    """The initial images of the validation trajectories."""
+    return _unit({stream: getattr(data.validation, stream)[:, 0] for stream in evaluation.STREAMS})
 
 
 def _unit(images: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Convert uint8 images to float32 in [0, 1]."""
     return {stream: image.astype(np.float32) / 255 for stream, image in images.items()}
-
-
-def _reduced(image: np.ndarray, side: int) -> np.ndarray:
-    """Reduce a square image to `side` pixels by averaging blocks of pixels."""
-    step = image.shape[0] // side
-    return image.reshape(side, step, side, step, 3).mean((1, 3))
 
 
 def draw(config: Config, data: Recorded, predicted: Mapping[str, Predicted], path: Path) -> None:
@@ -303,27 +285,20 @@ def draw(config: Config, data: Recorded, predicted: Mapping[str, Predicted], pat
 
 def as_table(config: Config, data: Recorded, summary: dict, logs: Mapping[str, list[dict]]) -> str:
     """Write the scores with their 95 % intervals (`evaluation.image_summary`) as a table in Markdown."""
-    names = [FLOOR, *dict.fromkeys(name for scores in summary.values() for name in scores["predictors"])]
-    heads = ["predictor"]
-    for stream in summary:
-        heads += [f"{stream} BCE (x1e-4)", f"{stream} skill", f"{stream} skill against the copy"]
-    lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
-    for name in names:
-        cells = []
+
+    def cell(x: Mapping[str, float], factor: float = 1, digits: int = 3) -> str:
+        value, low, high = (f"{factor * x[key]:.{digits}f}" for key in ("value", "low", "high"))
+        return f"{value} [{low}, {high}]"
+
+    titles = ("BCE (x1e-4)", "skill", "skill against the copy")
+    heads = ["predictor", *(f"{stream} {title}" for stream in summary for title in titles)]
+    rows = [heads, [FLOOR, *(text for x in summary.values() for text in (f"{1e4 * x['floor']:.0f}", "1", "1"))]]
+    for name in dict.fromkeys(name for scores in summary.values() for name in scores["predictors"]):
+        rows.append([name])
         for scores in summary.values():
-            row = scores["predictors"].get(name)
-            if name == FLOOR:
-                cells += [f"{1e4 * scores['floor']:.0f}", "1", "1"]
-            elif row is None:
-                cells += ["NA", "NA", "NA"]
-            else:
-                bce = {key: 1e4 * value for key, value in row["bce"].items()}
-                cells.append(f"{bce['value']:.0f} [{bce['low']:.0f}, {bce['high']:.0f}]")
-                cells += [
-                    f"{row[key]['value']:.3f} [{row[key]['low']:.3f}, {row[key]['high']:.3f}]"
-                    for key in ("skill", "skill_copy")
-                ]
-        lines.append(f"| {' | '.join([name, *cells])} |")
+            x = scores["predictors"].get(name)
+            rows[-1] += ["NA"] * 3 if x is None else [cell(x["bce"], 1e4, 0), cell(x["skill"]), cell(x["skill_copy"])]
+    lines = [f"| {' | '.join(row)} |" for row in rows]
     num = len(data.train.number), len(data.validation.number)
     steps = ", ".join(f"{name} {log[-1]['step'] if log else 0}" for name, log in logs.items())
     return "\n".join(
@@ -336,7 +311,9 @@ def as_table(config: Config, data: Recorded, summary: dict, logs: Mapping[str, l
             "of the true images. Skill is 1 - excess / excess of the constant, and the last column of a stream "
             "replaces the constant by the copy of the input, where excess is the BCE above its smallest value.",
             "",
-            *lines,
+            lines[0],
+            "|---" * len(heads) + "|",
+            *lines[1:],
             "",
             f"Gradient steps: {steps}, batch {config.training.batch_size}.",
             "",
