@@ -2,7 +2,7 @@
 
     python -m experiments.objects --out sheet.png --seed 0 --num 10
 
-`--view below` shows the objects as the sensor sees them. `--shuffle` draws the objects in random order without names, so
+`--view below` shows the objects as the sensor sees them. `--shuffle` draws them in random order without names, so
 that other people can try to recognise them. A line is printed for each object: its size, its number of faces, the
 number of vertices of its collision hull, and the largest distances by which the surface lies outside the hull and the
 hull outside the surface. With `--parts`, each object whose hull fits badly is first decomposed into convex parts.
