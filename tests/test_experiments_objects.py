@@ -47,8 +47,7 @@ def test_the_gaps_of_each_object_are_printed(tmp_path, capsys, monkeypatch):
         assert ("in 2 parts" in line) == apart
 
 
-def test_unknown_classes_and_zero_objects_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="teapot"):
-        objects.main(objects.Config(out=tmp_path / "a.png", categories=("teapot",)))
-    with pytest.raises(ValueError, match="num is 0"):
-        objects.main(objects.Config(out=tmp_path / "a.png", num=0))
+@pytest.mark.parametrize(("options", "message"), [({"categories": ("teapot",)}, "teapot"), ({"num": 0}, "num is 0")])
+def test_unknown_classes_and_zero_objects_are_refused(tmp_path, options, message):
+    with pytest.raises(ValueError, match=message):
+        objects.main(objects.Config(out=tmp_path / "a.png", **options))

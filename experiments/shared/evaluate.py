@@ -86,12 +86,12 @@ def evaluate(run: Run, data: dataset.Dataset, own: Extensions = NONE) -> str:
     pairs = _pairs(run, data, own)
     test, judge = pairs.test, evaluation.scorer(scenario, pairs.train, metrics=own.scored)
     with Bar() as bar:
+        predicted, shown = _scored(run, pairs, judge, bar)
         few = test.take(slice(config.num_rerolled))
         total = config.rerolls * len(few.object)
-        scores, rerolled = reroll(run, few, judge, lambda done: bar("re-roll", done, total))
-        scores |= {title: judge(row, test) for title, row in evaluation.baselines(scenario, pairs.train, test).items()}
-        predicted, shown = _scored(run, pairs, judge, bar)
-        scores |= predicted
+        rerolls, rerolled = reroll(run, few, judge, lambda done: bar("re-roll", done, total))
+        baselines = evaluation.baselines(scenario, pairs.train, test)
+        scores = {**rerolls, **{title: judge(row, test) for title, row in baselines.items()}, **predicted}
         summary = evaluation.summarise(scores, test, metrics=own.scored, outcomes=scenario.outcomes)
         bar("evaluate", len(predicted), len(predicted), "intervals done")
 
