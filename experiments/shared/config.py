@@ -160,12 +160,6 @@ class Extensions:
         """All metrics: those of the field `metrics`, and the error of each modality in `measurements`."""
         return (*self.metrics, *(evaluation.measurement_error(one) for one in self.measurements))
 
-    def described(self) -> list[Any]:
-        """All metrics, table columns and modalities as JSON values that can be compared."""
-        fields = [{name: str(x) for name, x in vars(metric).items() if not callable(x)} for metric in self.scored]
-        columns = [[column.heading, [metric.name for metric in column.metrics]] for column in self.columns]
-        return [fields, columns, [[one.name, one.shape, float(one.scale)] for one in self.measurements]]
-
 
 NONE = Extensions()
 

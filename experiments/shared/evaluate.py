@@ -116,13 +116,11 @@ def evaluate(run: Run, data: dataset.Dataset, own: Extensions = NONE) -> str:
 
 
 def _inputs(run: Run, data: dataset.Dataset, own: Extensions) -> dict[str, str]:
-    """The checksums of the configuration, the dataset and the models, and of a user's own metrics and columns."""
-    inputs = {"config.json": storage.digest(dataclasses.asdict(run.config)), "dataset": data.identity}
-    for folder in map(run.folder, MODELS[run.config.model]):
-        inputs[folder.relative_to(run.workdir).as_posix()] = identity(folder)
-    if own.described() != NONE.described():
-        inputs["the list of metrics"] = storage.digest(own.described())
-    return inputs
+    """The checksums of the configuration, the dataset, the models, and the names of the metrics and the columns."""
+    names = [metric.name for metric in own.scored], [column.heading for column in own.columns]
+    contents = {"config.json": dataclasses.asdict(run.config), "the list of metrics": names}
+    models = {f"models/{name}{run.suffix}": identity(run.folder(name)) for name in MODELS[run.config.model]}
+    return {"dataset": data.identity, **models, **{name: storage.digest(x) for name, x in contents.items()}}
 
 
 def _pairs(run: Run, data: dataset.Dataset, own: Extensions) -> SplitPairs:
