@@ -208,15 +208,12 @@ def test_a_work_directory_of_another_configuration_names_the_fields_that_differ(
 
 
 def test_a_second_run_in_a_work_directory_is_refused(folder, tmp_path):
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "objects.txt").write_text("of the first\n")
     with storage.lock(tmp_path / "run"):
         with pytest.raises(storage.LockedError, match="close what uses the folder in this process"):
             run.main(freefall.SMOKE, tmp_path / "run")
         with pytest.raises(storage.LockedError):
             run.configure(run.Args(tmp_path / "run", smoke_of_few(freefall), objects=folder))
-    assert not (tmp_path / "run" / "config.json").exists()
-    assert (tmp_path / "run" / "objects.txt").read_text() == "of the first\n"
+    assert not {"config.json", "objects.txt"} & {path.name for path in (tmp_path / "run").iterdir()}
 
 
 @pytest.mark.parametrize("asked", [(), ("box", "bottle")])

@@ -123,19 +123,11 @@ def test_the_models_are_trained_judged_and_resumed_on_a_device_without_adding_tr
     images = table2.read(TINY, work)
     first = images.validation.visual[:, 0].astype(np.float32) / 255
     numbers = json.loads((work / "table2" / "metrics.json").read_text())
-    for name in table2.NAMES:
-        predict = sts.Predictor.load(work / "table2" / "models" / name)
-        assert predict.modalities == MODELS["paper"][name]
-        assert predict.preprocessing.touch_level
-        if "visual" in predict.modalities:
-            out = predict(visual=first)
-            assert np.asarray(out.visual).shape == first.shape
+    predictors = {name: sts.Predictor.load(work / "table2" / "models" / name) for name in table2.NAMES}
+    assert {name: predict.modalities for name, predict in predictors.items()}.items() <= MODELS["paper"].items()
+    assert all(predict.preprocessing.touch_level for predict in predictors.values())
     target = images.validation.visual[:, 1] / 255
-    guess = np.clip(
-        np.asarray(sts.Predictor.load(work / "table2" / "models" / "vae-visual")(visual=first).visual),
-        1 / 510,
-        1 - 1 / 510,
-    )
+    guess = np.clip(np.asarray(predictors["vae-visual"](visual=first).visual), 1 / 510, 1 - 1 / 510)
     bce = -(target * np.log(guess) + (1 - target) * np.log1p(-guess)).mean()
     assert numbers["visual"]["predictors"]["VAE visual only"]["bce"]["value"] == pytest.approx(bce, rel=1e-4)
 
