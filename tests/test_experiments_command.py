@@ -61,7 +61,7 @@ def test_the_preset_paper_has_the_counts_of_the_paper(experiment, classes, traje
         assert set(dataset.class_names(one.collection)) == set(classes)
     paper, schedule = experiment.PAPER.collection, experiment.PAPER.training
     assert paper.num_trajectories == paper.num_full == trajectories
-    assert (paper.scenario.frames, paper.crop, paper.symmetries) == (60, True, False)
+    assert (paper.scenario.frames, paper.crop) == (60, True)
     assert (schedule.epochs, schedule.batch_size, schedule.beta_warmup) == (200, 64, 50 / 200)
     assert (experiment.PAPER.targets, experiment.PAPER.splits) == ("own", ("trajectory", "object"))
     model = training.paper_model(config.MODELS["paper"]["mvae"], experiment.PAPER.preprocessing)

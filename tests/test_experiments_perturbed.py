@@ -119,22 +119,6 @@ def test_views_and_falls_are_used_in_training(workdir):
     assert all(np.isfinite(value) for value in record.values())
 
 
-def test_the_condition_is_turned_with_the_pose(workdir):
-    data = dataset.load(workdir / "dataset")
-    rows = data.rendered()[[1, 0]]
-    pairs = data.pairs(rows, symmetries=True)
-    assert pairs.condition.shape == (16, 3)
-    assert pairs.condition.dtype == np.float32
-    np.testing.assert_array_equal(data.pairs(rows).condition, data.trajectory["condition"][rows])
-    np.testing.assert_array_equal(pairs.condition[[0, 8]], data.trajectory["condition"][rows])
-    # The angle from where it stands to where the pad goes stays, but for its sign in a mirror.
-    place, along = (x[..., 0] + 1j * x[..., 1] for x in (pairs.pose[:, 0], pairs.condition))
-    angle = np.angle(along / place).reshape(2, 2, 4)
-    np.testing.assert_allclose(angle[:, 0], np.tile(angle[:, 0, :1], 4), atol=1e-3)
-    np.testing.assert_allclose(angle[:, 1], np.tile(-angle[:, 0, :1], 4), atol=1e-3)
-    assert len(np.unique(np.round(np.angle(along[:8]), 3))) == 8
-
-
 def test_a_model_takes_a_jerk_in_si_units(workdir):
     data = dataset.load(workdir / "dataset")
     pairs = data.pairs(np.array([0]))
