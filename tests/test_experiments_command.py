@@ -218,7 +218,7 @@ def test_a_second_run_in_a_work_directory_is_refused(folder, tmp_path):
 
 @pytest.mark.parametrize("asked", [(), ("box", "bottle")])
 def test_the_classes_of_the_experiment_or_the_requested_ones_are_taken_from_a_folder(asked, folder, tmp_path):
-    args = run.Args(tmp_path / "run", smoke_of_few(perturbed), objects=folder, classes=asked, scale=0.5, up="y")
+    args = run.Args(tmp_path / "run", smoke_of_few(freefall), objects=folder, classes=asked, scale=0.5, up="y")
     one = run.configure(args).collection
     assert one.meshes is not None
     assert one.meshes.labels == ("bottle",) * 4 + ("box",) * (3 if asked else 0)

@@ -53,7 +53,7 @@ def test_trajectories_are_matched_by_their_number(folder, tmp_path):
     real, simulated = command.load(config(folder, other, tmp_path))
     assert list(real.group) == [1, 1, 2, 2, 4, 4, 5, 5, 6, 6]
     for stream in ("visual", "tactile"):
-        np.testing.assert_array_equal(getattr(real.images, stream), getattr(simulated.images, stream))
+        np.testing.assert_array_equal(getattr(real, stream), getattr(simulated, stream))
     np.testing.assert_array_equal(real.visual[2], pair(2, "initial", SIZE).visual.image)
     np.testing.assert_array_equal(real.tactile[3], pair(2, "final", SIZE).tactile.image)
 
