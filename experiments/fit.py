@@ -23,8 +23,7 @@ import tyro
 from matplotlib.figure import Figure
 
 import sts_jax as sts
-from experiments import sense
-from experiments.shared import drawing
+from experiments.shared import drawing, laying
 from experiments.shared.terminal import on_one_line
 from sts_jax import tactile
 
@@ -39,7 +38,7 @@ SEEN = 0.02  # smallest change of a pixel's value by touch that counts as an imp
 
 
 @dataclasses.dataclass(frozen=True)
-class Config(sense.Placed):
+class Config(laying.Placed):
     """Options of the command line: the object, its true pose, and the number of fits."""
 
     out: Path = Path("fit.png")  # path of the picture
@@ -175,14 +174,14 @@ def draw(config: Config, target: np.ndarray, paths: list[list[tuple[np.ndarray, 
 
 def main(config: Config) -> None:
     """Render a tactile image of the object on the pad, fit the pose to it several times, and draw the result."""
-    sense.check(config)
+    laying.check(config)
     if config.starts < 1:
         raise ValueError(f"--starts is {config.starts}, but it must be at least 1")
     if config.force == 0:
         raise ValueError("--force is 0, but it must be > 0 (N), so that the object leaves an imprint")
     sensor = sts.Sensor() if config.sensor is None else sts.Sensor.load(config.sensor)
-    body = sense.read(config, config.mesh)
-    pose, wrench, words = sense.lay(config, sensor, body)
+    body = laying.read(config, config.mesh)
+    pose, wrench, words = laying.lay(config, sensor, body)
     given = jnp.asarray(pose, jnp.float32), jnp.asarray(wrench, jnp.float32)
     target = touch(sensor, body, *given, resolution=config.resolution)
     empty = touch(sensor, body, given[0].at[2].set(-1), given[1], resolution=config.resolution)
