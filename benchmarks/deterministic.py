@@ -11,6 +11,7 @@ import dataclasses
 import functools
 import itertools
 import time
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import jax

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import sts_jax as sts
 from experiments import sense
+from experiments.shared import laying
 
 pytestmark = pytest.mark.slow
 
@@ -45,10 +46,10 @@ def test_all_streams_of_a_class_in_one_picture(tmp_path, capsys):
 
 def test_a_file_is_pressed_by_its_weight(box, tmp_path, capsys):
     config = sense.Config(str(box), out=tmp_path / "box.png", resolution=TINY, mass=0.2, crop=True)
-    body, sensor = sense.read(config, str(box)), sts.Sensor()
+    body, sensor = laying.read(config, str(box)), sts.Sensor()
     frame, _, words = sense.look(config, sensor, body)
     assert "0.2 kg, pressed by 1.96 N" in words
-    assert float(frame.pressure.sum()) * 1e-6 == pytest.approx(0.2 * sense.G, rel=0.005)
+    assert float(frame.pressure.sum()) * 1e-6 == pytest.approx(0.2 * laying.G, rel=0.005)
     # its largest face, 40 x 30 mm, by p = k d
     assert "deepest imprint 0.82 mm, contact area 1200 mm2, balanced" in words
     assert bool(frame.balanced)
@@ -58,10 +59,10 @@ def test_a_file_is_pressed_by_its_weight(box, tmp_path, capsys):
 
 def test_the_object_lies_at_the_configured_place(box):
     config = sense.Config(str(box), mass=0.1, position=(0.02, -0.01), turn=90.0)
-    body = sense.read(config, str(box))
+    body = laying.read(config, str(box))
 
     def corners(config):
-        pose, wrench, words = sense.lay(config, sts.Sensor(), body)
+        pose, wrench, words = laying.lay(config, sts.Sensor(), body)
         w, x, y, z = pose[3:]
         return Rotation.from_quat([x, y, z, w]).apply(np.asarray(body.vertices, float)) + pose[:3], wrench, words
 
@@ -99,7 +100,7 @@ def test_a_sensor_of_a_file_is_used(box, tmp_path):
     soft = sense.look(
         sense.Config(str(box), resolution=TINY, mass=0.1),
         sts.Sensor.load(path),
-        sense.read(sense.Config(str(box), mass=0.1), str(box)),
+        laying.read(sense.Config(str(box), mass=0.1), str(box)),
     )[2]
     assert "deepest imprint 0.82 mm" in soft
 
