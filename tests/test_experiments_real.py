@@ -19,7 +19,6 @@ from test_hardware_collecting import check
 import sts_jax as sts
 from benchmarks.instruments.peers import DARK, LIT, SIZE, SensorPeer
 from experiments import real
-from experiments.shared.collecting import person
 from experiments.shared.page import CollectPage
 from experiments.shared.terminal import Terminal
 from sts_jax import hardware
@@ -150,11 +149,12 @@ def test_an_address_in_use_is_named(page):
         CollectPage("127.0.0.1", page.port)
 
 
-def test_the_page_states_where_it_listens(capsys):
-    for host, text in (("127.0.0.1", "only this computer can watch and press"), ("0.0.0.0", "EVERY computer")):
-        with person(real.Collect(host=host, port=0)):
-            pass
-        assert f"listens on {host}, so {text}" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("host", "text"), [("127.0.0.1", "only this computer can watch and press"), ("0.0.0.0", "EVERY computer")]
+)
+def test_the_page_states_where_it_listens(capsys, host, text):
+    CollectPage(host, 0).close()
+    assert f"listens on {host}, so {text}" in capsys.readouterr().err
 
 
 def test_lines_act_in_the_stage_that_the_person_has_seen(monkeypatch, capsys):

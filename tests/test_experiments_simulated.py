@@ -8,7 +8,7 @@ import pytest
 import sts_jax as sts
 from experiments import real
 from experiments.shared import collecting
-from experiments.shared.collecting import Collect, Hand, commissioned, simulate, started
+from experiments.shared.collecting import Collect, Hand, commissioned, started
 from sts_jax import hardware
 from sts_jax.hardware import twin
 
@@ -24,7 +24,7 @@ def ends(workdir):
 @pytest.mark.slow
 def test_an_interrupted_collection_of_the_twin_equals_an_uninterrupted_one(tmp_path, monkeypatch, capsys):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
-    simulate(Collect(whole, count=5, **SMALL))
+    collecting.collect(Collect(whole, twin=True, count=5, **SMALL))
     show = Hand.show
 
     def interrupted(self, view):
@@ -34,7 +34,7 @@ def test_an_interrupted_collection_of_the_twin_equals_an_uninterrupted_one(tmp_p
 
     monkeypatch.setattr(Hand, "show", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        simulate(Collect(parts, count=5, **SMALL))
+        collecting.collect(Collect(parts, twin=True, count=5, **SMALL))
     monkeypatch.undo()
     kept = {path: path.read_bytes() for path in parts.rglob("*.png")}
     real.main(Collect(parts, twin=True, count=5, **SMALL))

@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import datetime
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -76,46 +75,75 @@ class Review:
     debug: bool = False  # show the traceback of every error
 
 
+# sensor, session, person, and the look of the empty pad, if it is known
+Setup = tuple[hardware.PairReader, hardware.Session, Person, EmptyPad | None]
+
+
 def collect(config: Collect) -> None:
-    """Connect the sensor, and save trajectories until there are enough of them or the user stops the command."""
+    """Connect the sensor, and save trajectories until there are enough of them or the user stops the command.
+
+    A twin has a fixed sequence of trajectories for each seed, which an interrupted collection continues.
+    """
+    dataset, count = config.workdir / "dataset", config.count or (TWIN_COUNT if config.twin else None)
+    check_options(config)
+    there = (dataset / storage.MANIFEST).exists() and len(hardware.load_recordings(dataset))
+    if count is not None and there >= count:
+        say(f"{dataset} has {count} trajectories already")
+        return
+    with contextlib.ExitStack() as stack:
+        prepare = of_twin if config.twin else of_device
+        sensor, session, someone, empty = prepare(config, dataset, stack)
+        before, begun_s = session.confirmed, time.monotonic()
+        say(f"{dataset} has {before} confirmed trajectories. New ones are added")
+        trusted, guide, note = config.automatic or config.twin, config.guide, config.note
+        try:
+            hardware.collect(
+                sensor, session, someone, config=guide, empty=empty, trusted=trusted, count=count, note=note
+            )
+        finally:
+            number, seconds = session.confirmed - before, time.monotonic() - begun_s
+            say(f"{number} new trajectories in {seconds:.1f} s, {seconds / max(number, 1):.2f} s each")
+
+
+def check_options(config: Collect) -> None:
+    """Refuse options that exclude each other."""
     if config.count is not None and config.count < 1:
         raise ValueError(f"--count must be >= 1, got {config.count}")
     given = [f"--{name}" for name in ("sensor", "camera", "leds") if getattr(config, name) is not None]
     if config.twin and given:
         raise ValueError(f"{given[0]} and --twin exclude each other: leave out one of them")
-    if config.twin:
-        simulate(config)
-    elif config.sensor is None:
+    if not config.twin and config.sensor is None:
         raise ValueError("--sensor is missing: give the sensor file of `experiments.commission`, or --twin")
-    elif config.size != TWIN_SIZE:
+    if not config.twin and config.size != TWIN_SIZE:
         raise ValueError(f"--size is {config.size}, but the sensor file {config.sensor} determines the size")
+
+
+def of_device(config: Collect, dataset: Path, stack: contextlib.ExitStack) -> Setup:
+    """Connect the sensor of a sensor file, and show a page or the terminal to a person."""
+    assert config.sensor is not None
+    sensor = hardware.STS.from_file(config.sensor, camera=config.camera, leds=config.leds)
+    backgrounds = hardware.Device.load(config.sensor).backgrounds(config.sensor)
+    someone: Person
+    if config.headless:
+        someone = Terminal(config.count, listens=not config.automatic)
     else:
-        collect_from(config, config.sensor)
+        page = CollectPage(config.host, config.port, count=config.count)
+        someone = stack.enter_context(contextlib.closing(page))
+    say("connecting. Keep the pad empty, and do not move anything in view")
+    stack.enter_context(sensor)
+    session = stack.enter_context(hardware.Session(dataset, hardware.Origin.of(sensor)))
+    keep(config.sensor, config.workdir)
+    empty = None if backgrounds is None else hardware.known_pad(*backgrounds)
+    return sensor, session, Automatic(someone) if config.automatic else someone, empty
 
 
-def collect_from(config: Collect, file: Path) -> None:
-    """Save trajectories of the sensor of a sensor file, with a person."""
-    sensor = hardware.STS.from_file(file, camera=config.camera, leds=config.leds)
-    backgrounds = hardware.Device.load(file).backgrounds(file)
-    with person(config) as someone:
-        say("connecting. Keep the pad empty, and do not move anything in view")
-        with sensor, hardware.Session(config.workdir / "dataset", hardware.Origin.of(sensor)) as session:
-            keep(file, config.workdir)
-            say(f"{session.folder} has {session.confirmed} confirmed trajectories. New ones are added")
-            try:
-                hardware.collect(
-                    sensor,
-                    session,
-                    someone,
-                    config=config.guide,
-                    empty=None if backgrounds is None else hardware.known_pad(*backgrounds),
-                    trusted=config.automatic,
-                    count=config.count,
-                    note=config.note,
-                )
-            except KeyboardInterrupt:
-                say("stopped")
-            say(f"{session.confirmed} confirmed trajectories in {session.folder}")
+def of_twin(config: Collect, dataset: Path, stack: contextlib.ExitStack) -> Setup:
+    """Start a twin on its virtual clock, and a hand that moves its object."""
+    device = stack.enter_context(started(config, hardware.next_recording(dataset)))
+    sensor, empty = commissioned(config, device)
+    session = stack.enter_context(hardware.Session(dataset, sensor.origin))
+    hand = Hand(device, session, stack.enter_context(Bar()), config.count or TWIN_COUNT)
+    return sensor, session, hand, empty
 
 
 def keep(file: Path, workdir: Path) -> None:
@@ -128,17 +156,6 @@ def keep(file: Path, workdir: Path) -> None:
             f"{workdir / hardware.sensor_file.NAME} differs from {file}, but one sensor file must describe all "
             "trajectories of a work directory: choose another --workdir"
         )
-
-
-@contextlib.contextmanager
-def person(config: Collect) -> Iterator[Person]:
-    """The terminal or the page that shows instructions to a person and receives the person's actions."""
-    if config.headless:
-        terminal = Terminal(config.count, listens=not config.automatic)
-        yield Automatic(terminal) if config.automatic else terminal
-        return
-    with contextlib.closing(CollectPage(config.host, config.port, count=config.count)) as page:
-        yield Automatic(page) if config.automatic else page
 
 
 class Automatic(AutomaticPerson):
@@ -220,35 +237,6 @@ class Hand(AutomaticPerson):
             self._session.begin()
         self._placed, self._held_s = True, self._now_s
         self._device.command("hold")
-
-
-def simulate(config: Collect) -> None:
-    """Collect trajectories of a twin, on its virtual clock, until the work directory has enough of them.
-
-    A twin has a fixed sequence of trajectories for each seed, which an interrupted collection continues.
-    """
-    dataset, count = config.workdir / "dataset", config.count or TWIN_COUNT
-    if (dataset / storage.MANIFEST).exists() and len(hardware.load_recordings(dataset)) >= count:
-        say(f"{dataset} has {count} trajectories already")
-        return
-    with started(config, hardware.next_recording(dataset)) as device:
-        sensor, empty = commissioned(config, device)
-        with hardware.Session(dataset, sensor.origin) as session, Bar() as bar:
-            say(f"{dataset} has {session.confirmed} confirmed trajectories. New ones are added")
-            begun_s = time.monotonic()
-            number = hardware.collect(
-                sensor,
-                session,
-                Hand(device, session, bar, count),
-                config=config.guide,
-                empty=empty,
-                trusted=True,
-                count=count,
-                note=config.note,
-            )
-            bar("collect", count, count)
-        seconds = time.monotonic() - begun_s
-        say(f"{number} trajectories in {seconds:.1f} s, {seconds / number:.2f} s each")
 
 
 def started(config: Collect, first: int) -> twin.Twin:

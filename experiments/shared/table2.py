@@ -9,7 +9,7 @@ import numpy as np
 import tyro
 
 import sts_jax as sts
-from experiments.shared.collecting import Collect, simulate
+from experiments.shared.collecting import Collect, collect
 from experiments.shared.config import MODELS, TITLES
 from experiments.shared.evaluate import identity, record, stale
 from experiments.shared.run import Job, Stage, train_model
@@ -80,7 +80,7 @@ def main(args: Train) -> None:
     sts.enable_compilation_cache()
     if args.only in (None, "collect") and (count := missing(config, workdir)):
         say(f"collect: {count} trajectories of the digital twin into {workdir / 'dataset'}")
-        simulate(Collect(workdir, twin=True, count=config.count, size=config.size))
+        collect(Collect(workdir, twin=True, count=config.count, size=config.size))
     if args.only == "collect":
         return
     data = read(config, workdir)
