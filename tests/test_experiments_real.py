@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from led_simulator import WAIT_S
-from page_client import ask, streamed
+from page_client import ask
 from player import Player
 from session_writer import ORIGIN, pair
 from test_hardware_collecting import check
@@ -112,12 +112,6 @@ def test_the_page_shows_a_view(page):
     assert ask(page, "GET", "/end/initial/tactile.jpg")[1].startswith(b"\xff\xd8")
     for path in ("/end/final/tactile.jpg", "/end/initial/pair.json", "/end/__class__/visual.jpg", "/../real.py"):
         assert ask(page, "GET", path)[0] == 404
-
-
-def test_the_page_streams_each_pair_once(page):
-    for jpeg in streamed(page, "/tactile.mjpg", [view() for _ in range(3)]):
-        assert jpeg.startswith(b"\xff\xd8")
-        assert jpeg.endswith(b"\xff\xd9")
 
 
 def test_buttons_count_only_for_the_stage_that_was_shown(page):
