@@ -26,7 +26,6 @@ TWIN_RATE = 15.0  # frame rate of a collecting twin (frames/s). The guide needs 
 # Rendered poses per second of a moving object of a collecting twin. They must follow each other fast enough that the
 # guide does not take the object for one at rest.
 MOTION_RATE = 4.0
-LEVELS = (255, 255, 255, 255)  # duty cycles of the twin's LED channels in the tactile stream
 _PATIENCE_S = 60.0  # longest wait of the twin's hand for a new instruction (s on the twin's clock)
 _UNSEEN_S = 3.0  # time without a visible contact after which the next held pose is tried (s)
 _UNSEEN = 10  # held poses in a row without a visible contact after which the hand gives up
@@ -246,35 +245,29 @@ def started(config: Collect, first: int) -> twin.Twin:
 
 
 def commissioned(config: Collect, device: twin.Twin) -> tuple[twin.VirtualSensor, EmptyPad]:
-    """Connect to a twin with the sensor file of the work directory, which is written first if it is missing."""
-    file, settling = config.workdir / hardware.sensor_file.NAME, None
+    """Connect to a twin with an empty pad, and write its sensor file if the work directory has none."""
+    file, simulated = config.workdir / hardware.sensor_file.NAME, sts.Sensor()
     if file.exists():
         there = hardware.Device.load(file)
         there.check_identity(camera=twin.CAMERA, leds=device.serial_number)
         if (there.lens.width, there.lens.height) != config.size:
-            raise ValueError(
-                f"{file} is for images of {there.lens.width} x {there.lens.height} pixels, but --size is "
-                f"{config.size}: change it, or choose another --workdir"
-            )
-        settling = hardware.Settling(there.settle_off_s, there.settle_on_s)
-    sensor = twin.VirtualSensor(device, levels=LEVELS, settling=settling)
-    if settling is None:
-        simulated = sts.Sensor()
-        made = hardware.Device(
+            size = f"{there.lens.width} x {there.lens.height}"
+            raise ValueError(f"--size is {config.size}, but {file} is for images of {size} pixels")
+    sensor = twin.VirtualSensor(device)
+    backgrounds = commissioning.record_empty(sensor)
+    if not file.exists():
+        config.workdir.mkdir(parents=True, exist_ok=True)
+        hardware.Device(
             camera=twin.CAMERA,
             fps=device.rate,
             leds=device.serial_number,
             lens=commissioning.ideal_lens(config.size, FIELD_OF_VIEW, simulated),
             settle_on_s=sensor.settling.tactile_s,
             settle_off_s=sensor.settling.visual_s,
-            levels=LEVELS,
+            levels=sensor.levels,
             commissioned=datetime.date.today().isoformat(),
             lens_from="ideal",
-        )
-        config.workdir.mkdir(parents=True, exist_ok=True)
-        made.save(config.workdir, simulated, commissioning.record_empty(sensor))
-    backgrounds = hardware.Device.load(file).backgrounds(file)
-    assert backgrounds is not None, "this function has recorded them"
+        ).save(config.workdir, simulated, backgrounds)
     return sensor, hardware.known_pad(*backgrounds)
 
 
