@@ -264,7 +264,7 @@ def commissioned(config: Collect, device: twin.Twin) -> tuple[twin.VirtualSensor
             lens=commissioning.ideal_lens(config.size, FIELD_OF_VIEW, simulated),
             settle_on_s=sensor.settling.tactile_s,
             settle_off_s=sensor.settling.visual_s,
-            levels=sensor.levels,
+            levels=sensor.origin.levels,
             commissioned=datetime.date.today().isoformat(),
             lens_from="ideal",
         ).save(config.workdir, simulated, backgrounds)
