@@ -147,7 +147,7 @@ def _length_s(bench: Bench, least_s: float, longest_s: float) -> float:
 
 
 def _answers(word: str) -> Callable[[Bench], None]:
-    """Make a function that spoils one to four answers of the controller. `word` is a fault of `led_peer.Peer`."""
+    """Make a function that spoils one to four answers of the controller. `word` is a fault of `peers.Peer`."""
 
     def fault(bench: Bench) -> None:
         bench.peer.leds.faults = [word] * bench.draw.randint(1, 4)
@@ -191,7 +191,7 @@ def _renamed(bench: Bench) -> None:
 
 
 def _camera(mode: str, least_s: float = 0.1, longest_s: float = 1.5) -> Callable[[Bench], None]:
-    """Make a function that sets a mode of `camera_server.MotionJpeg` for a random time (s)."""
+    """Make a function that sets a mode of `peers.MotionJpeg` for a random time (s)."""
 
     def fault(bench: Bench) -> None:
         bench.peer.camera.mode = mode

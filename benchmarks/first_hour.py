@@ -1,10 +1,8 @@
 """Waiting times of a new user (first image, another resolution, gradient, simulation), and frames/s of `jax.vmap`.
 
-python -m benchmarks.first_hour            # about six minutes on two CPU cores
-python -m benchmarks.first_hour --vmap     # only the rates of `jax.vmap` and `jax.lax.map`
+python -m benchmarks.first_hour    # about six minutes on two CPU cores
 """
 
-import dataclasses
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -19,13 +17,6 @@ from benchmarks.instruments.first_steps import CLASS
 from benchmarks.instruments.timing import fresh, in_turn
 
 FRAMES = 32
-
-
-@dataclasses.dataclass(frozen=True)
-class Args:
-    """Options of the command line."""
-
-    vmap: bool = False  # print only the rates of `jax.vmap` and `jax.lax.map`
 
 
 def waiting() -> None:
@@ -73,12 +64,11 @@ def rates() -> None:
         print(f"{name:<32}{rate[0]:>12.0f}{rate[1]:>12.0f}{ratio:>12.2f}")
 
 
-def main(args: Args) -> None:
+def main() -> None:
     """Print the waiting times, and the frames and gradients per second."""
-    if not args.vmap:
-        waiting()
+    waiting()
     rates()
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    tyro.cli(main, description=__doc__)

@@ -70,7 +70,7 @@ def complaints(workdir, top, inputs):
     return []
 
 
-def test_damage_of_any_file_of_a_work_directory_is_named_or_the_file_is_made_again(workdir, tmp_path):
+def test_damage_of_any_file_is_named_or_the_file_is_made_again(workdir, tmp_path):
     copy = shutil.copytree(workdir, tmp_path / "copy")
     inputs = {part: fact.get("inputs", fact) for part, fact in storage.read_manifest(copy, "").facts.items()}
     assert "evaluation by object" in inputs

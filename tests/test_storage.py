@@ -93,7 +93,9 @@ def test_each_mismatch_of_a_folder_with_its_manifest_is_named(tmp_path):
         (tmp_path / name).write_text(name)
     assert storage.read_manifest(tmp_path, "remedy") is None
     manifest = storage.write_manifest(tmp_path, storage.checksums(tmp_path, "ab"), {"step": 3})
-    assert storage.read_manifest(tmp_path, "remedy") == manifest
+    assert storage.read_manifest(tmp_path, "remedy") == storage.read_manifest(tmp_path, "remedy", "step") == manifest
+    with pytest.raises(storage.DamagedFileError, match=r"manifest\.json is that of another folder .*no note.*: remedy"):
+        storage.read_manifest(tmp_path, "remedy", "step", "note")
     storage.verify(tmp_path, manifest, "remedy")
     (tmp_path / "a").write_text("b")
     for names, message in ((None, "a is not the file"), (["b", "c"], "c is not listed in")):
