@@ -67,7 +67,6 @@ def board_pixels(pose):
 def test_the_page_shows_the_board_at_the_stated_dimensions():
     page = hardware.board_image(BOARD)
     assert page.shape == (2970, 2100)
-    assert page.dtype == np.uint8
     board = page[100 + 30 : 100 + 30 + 1440, 300 + 30 : 300 + 30 + 1440]  # 10 pixels per mm, in the middle of the frame
     np.testing.assert_array_equal(board, calibration_images.printed(BOARD)[0])
     assert (page[99, 299:1801] == 160).all()  # the frame of 150 mm
@@ -137,26 +136,17 @@ def assert_recovered(calibration, *, view_error, position_error):
     assert np.linalg.norm(maps[0] - maps[1], axis=-1).max() < view_error
 
 
-def test_a_clean_set_gives_back_the_lens_and_the_pad(images):
-    calibration = calibrate(images)
-    assert max(calibration.errors) < 0.3
-    assert calibration.corners[0] == 64
-    assert math.degrees(calibration.largest_angle) > 50
-    assert_recovered(calibration, view_error=0.2, position_error=2e-4)
-
-
 def test_blur_and_noise_give_back_the_lens_and_a_marker_on_the_pad(noisy, rays, printed):
     calibration = calibrate(noisy)
     assert max(calibration.errors) < 0.35
     assert np.sqrt(np.mean(np.square(calibration.errors))) < 0.3
+    assert math.degrees(calibration.largest_angle) > 50
     assert_recovered(calibration, view_error=0.3, position_error=5e-4)
     raw = calibration_images.board_view(rays, *printed, *POSES[0])
     corners = hardware.find_board(hardware.rectified(calibration.lens, PINHOLE, raw, (480, 640)), BOARD)
     expected = BOARD.corners[corners.numbers][:, :2] / 0.15 * 480 + [319.5, 239.5]  # 0.15 m is the height of the view
     assert len(corners.numbers) == 64
-    errors = np.linalg.norm(corners.pixels - expected, axis=-1)
-    assert errors.mean() < 0.3
-    assert errors.max() < 1.0
+    assert np.linalg.norm(corners.pixels - expected, axis=-1).max() < 1.0
 
 
 def test_a_board_that_lies_on_the_pad_in_another_orientation_gives_the_same_pad(images, rays, printed):
@@ -234,10 +224,11 @@ def test_the_refraction_of_the_gel_becomes_a_part_of_the_lens():
     calibration = hardware.fit_lens(found, (640, 480), BOARD)
     points = pad_points()
     seen = refracted(lens, points + lens.translation)
-    ignored = np.linalg.norm(hardware.project(lens, points) - seen, axis=-1)
-    remaining = np.linalg.norm(hardware.project(calibration.lens, points) - seen, axis=-1)
-    assert ignored.max() > 2
-    assert remaining.max() < 0.3
+    ignored, remaining = (
+        np.linalg.norm(hardware.project(used, points) - seen, axis=-1).max() for used in (lens, calibration.lens)
+    )
+    assert ignored > 2
+    assert remaining < 0.3
     assert 0.001 < lens.translation[2] - calibration.lens.translation[2] < 0.0025  # the pad appears nearer
 
 

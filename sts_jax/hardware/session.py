@@ -348,12 +348,10 @@ def _read_pair(path: Path, remedy: str) -> Pair:
 
 def encoded_pair(pair: Pair) -> dict[str, bytes]:
     """Encode the images of a pair as `visual.png` and `tactile.png`."""
-    files = {}
-    for shot in (pair.visual, pair.tactile):
-        done, data = cv2.imencode(".png", cv2.cvtColor(shot.image, cv2.COLOR_RGB2BGR), _PNG)
-        assert done
-        files[f"{shot.stream}.png"] = data.tobytes()
-    return files
+    return {
+        f"{shot.stream}.png": cv2.imencode(".png", cv2.cvtColor(shot.image, cv2.COLOR_RGB2BGR), _PNG)[1].tobytes()
+        for shot in (pair.visual, pair.tactile)
+    }
 
 
 def shot_facts(shot: Shot) -> dict[str, Any]:
