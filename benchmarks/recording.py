@@ -21,7 +21,7 @@ import numpy as np
 import tyro
 
 from sts_jax import storage
-from sts_jax.hardware import Lit, Origin, Pair, Recorder, Shot, proof, recording, session
+from sts_jax.hardware import Lit, Origin, Pair, Recorder, Shot, recording, session, sts
 
 SIZES = ((640, 480), (1640, 1232))
 
@@ -38,7 +38,7 @@ class Args:
 def pair(random: np.random.Generator, width: int, height: int, noise: float) -> Pair:
     """Make a smooth visual and a smooth tactile image with noise of a standard deviation (grey levels)."""
 
-    def shot(stream: proof.Stream, level: int) -> Shot:
+    def shot(stream: sts.Stream, level: int) -> Shot:
         smooth = cv2.GaussianBlur(random.uniform(0, 1, (height, width, 3)).astype(np.float32), (0, 0), width / 50)
         smooth = (smooth - smooth.min()) / (smooth.max() - smooth.min())
         image = np.clip(level + 120 * smooth + random.normal(0, noise, smooth.shape), 0, 255).astype(np.uint8)

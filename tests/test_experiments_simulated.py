@@ -72,7 +72,7 @@ def test_the_sensor_file_of_the_twin_rectifies_to_the_simulated_view(tmp_path):
     for shot in (pair.visual, pair.tactile):
         background = made.backgrounds(tmp_path)[shot.stream == "tactile"]
         assert np.abs(background - shot.image.astype(float)).mean() < 2
-    assert np.abs(empty.mean.visual - sts.hardware.proof.thumbnail(pair.visual.image)).mean() < 1
+    assert np.abs(empty.mean.visual - sts.hardware.sts.thumbnail(pair.visual.image)).mean() < 1
     # The object's middle, seen through the lens of the file, lies at the place of its pose.
     dark = np.abs(made.backgrounds(tmp_path)[0] - held.visual.image.astype(float)).mean(-1)
     mask = np.repeat((255 * (dark > 30)).astype(np.uint8)[..., None], 3, -1)

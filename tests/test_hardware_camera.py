@@ -1,5 +1,6 @@
 """The camera against a motion JPEG server with injected faults, and against a fake device of OpenCV."""
 
+import concurrent.futures
 import re
 import threading
 import time
@@ -18,7 +19,6 @@ from sts_jax.hardware import (
     FrameSizeError,
     FrozenCameraError,
     OpenCVCamera,
-    StaleFrameError,
     find_cameras,
     opencv,
 )
@@ -115,54 +115,38 @@ def test_async_read_returns_every_frame_in_order_and_without_a_buffer_the_newest
         time.sleep(0.4)
         frames = [camera.async_read() for _ in range(30)]
         assert camera.statistics.skipped == 0
-    assert np.all(np.diff([number_of(frame.image) for frame in frames]) == 1)
-    assert np.all(np.diff([frame.sequence for frame in frames]) == 1)
+    assert np.all(np.diff([(number_of(frame.image), frame.sequence) for frame in frames], axis=0) == 1)
     assert np.all(np.diff([frame.time_s for frame in frames]) > 0)
-    assert {frame.epoch for frame in frames} == {0}
     with connected(server) as camera:
         assert wait_until(lambda: camera.statistics.skipped > 5)
 
 
 def test_images_are_rgb_and_read_only():
     server = MotionJpeg(colour=(0, 0, 255))  # red for OpenCV
-    try:
-        with connected(server) as camera:
-            image = camera.read().image
-    finally:
-        server.stop()
+    with connected(server) as camera:
+        image = camera.read().image
+    server.stop()
+    np.testing.assert_allclose(image[40:, 40:].reshape(-1, 3).mean(0), [255, 0, 0], atol=15)
     assert image.dtype == np.uint8
-    red, green, blue = image[40:, 40:].reshape(-1, 3).mean(0)
-    assert red > 240
-    assert green < 15
-    assert blue < 15
-    with pytest.raises(ValueError, match="read-only"):
-        image[0, 0] = 0
+    assert not image.flags.writeable
 
 
-def test_lost_frames_are_counted_from_the_times(server):
-    with connected(server, buffer=200) as camera:
-        assert wait_until(lambda: camera.statistics.rate is not None)
-        start = server.number + 20
-        server.skipped = set(range(start, start + 40))
-        server.mode = "skip"
-        frame = camera.async_read()
-        while number_of(frame.image) < start + 40:
-            frame = camera.async_read()
-        assert 20 < frame.dropped < 80  # 40, if the machine is not busy
-        assert camera.statistics.dropped >= frame.dropped
+JITTER = 0.1 * np.arange(200) + np.random.default_rng(0).uniform(0, 0.06, 200)
+JITTER[50:53] = [5.16, 5.2, 5.25]  # late, and made up for
 
 
 @pytest.mark.parametrize(
-    ("times", "rate", "dropped"),
+    ("times", "nominal", "rate", "dropped"),
     [
-        ([0.05 * n + 0.002 * (n % 3) for n in range(60) if n not in (20, 30, 31, 40, 41, 42)], 20, 6),
-        ([*0.1 * np.arange(20), 2.3, 2.31, 2.32, 2.33, 2.4], 10, 0),  # four frames arrive together, and none is lost
-        ([*0.1 * np.arange(10), *(5.0 + 0.002 * np.arange(41)), *(5.1 + 0.1 * np.arange(9))], 10, 0),  # held back
-        ([*0.1 * np.arange(10), *(1.5 + 0.02 * np.arange(100))], 50, None),  # faster after a gap
+        ([0.05 * n + 0.002 * (n % 3) for n in range(60) if n not in (20, 30, 31, 40, 41, 42)], None, 20, 6),
+        ([*0.1 * np.arange(20), 2.3, 2.31, 2.32, 2.33, 2.4], None, 10, 0),  # four frames arrive together, none is lost
+        ([*0.1 * np.arange(10), *(5.0 + 0.002 * np.arange(41)), *(5.1 + 0.1 * np.arange(9))], None, 10, 0),  # held back
+        ([*0.1 * np.arange(10), *(1.5 + 0.02 * np.arange(100))], None, 50, None),  # faster after a gap
+        (JITTER, 10.0, 10, 0),
     ],
 )
-def test_rate_and_lost_frames_follow_from_the_times(times, rate, dropped):
-    pace = Pace(None)
+def test_rate_and_lost_frames_follow_from_the_times(times, nominal, rate, dropped):
+    pace = Pace(nominal)
     estimates = [pace.arrived(time_s) for time_s in times]
     assert pace.rate == pytest.approx(rate, rel=0.1)
     assert not pace.delayed
@@ -174,51 +158,18 @@ def test_rate_and_lost_frames_follow_from_the_times(times, rate, dropped):
 def test_frames_that_may_have_waited_are_marked():
     """The frames of 1.0 to 1.5 s arrive together at 1.52 s, the camera misses one, and then is found again."""
     pace, held = Pace(None), []
-    for time_s in [*0.1 * np.arange(10), *(1.52 + 0.002 * np.arange(6)), 1.6, 1.7, 1.9, 2.0]:
+    for time_s in [*0.1 * np.arange(10), *(1.52 + 0.002 * np.arange(6)), 1.6, 1.7, 1.9, 2.0, 5.0, 5.002, 5.1, 5.2]:
+        if time_s == 5.0:
+            pace.interrupted()
         pace.arrived(time_s)
         held.append(pace.delayed)
-    assert held == [10 <= i < 16 for i in range(20)]
-    pace.interrupted()
-    for time_s in (5.0, 5.002, 5.1, 5.2):
-        pace.arrived(time_s)
-        held.append(pace.delayed)
-    assert held[20:] == [True, True, False, False]
-
-
-def test_jitter_is_not_counted_as_loss():
-    pace = Pace(10.0)
-    times = 0.1 * np.arange(200) + np.random.default_rng(0).uniform(0, 0.06, 200)
-    times[50:53] = [5.16, 5.2, 5.25]  # late, and made up for
-    for time_s in times:
-        pace.arrived(time_s)
-        assert not pace.delayed
-    assert pace.dropped == 0
-
-
-def test_read_latest_refuses_an_old_frame(server):
-    with connected(server) as camera:
-        frame = camera.read()
-        assert camera.read_latest(max_age_ms=5000).sequence >= frame.sequence
-        server.mode = "stall"
-        assert wait_until(lambda: time.monotonic() - camera.read_latest(1e6).time_s > 0.3)
-        with pytest.raises(StaleFrameError, match="ms old, max_age_ms=100"):
-            camera.read_latest(max_age_ms=100)
-        server.mode = "live"
+    assert np.flatnonzero(held).tolist() == [10, 11, 12, 13, 14, 15, 20, 21]
 
 
 def test_two_threads_never_get_the_same_frame(server):
-    got = [[], []]
-
-    def work(mine):
-        mine.extend(camera.async_read().sequence for _ in range(20))
-
-    with connected(server, buffer=10) as camera:
-        threads = [threading.Thread(target=work, args=(mine,)) for mine in got]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-    assert len(set(got[0] + got[1])) == 40
+    with connected(server, buffer=10) as camera, concurrent.futures.ThreadPoolExecutor(2) as pool:
+        sequences = pool.map(lambda _: camera.async_read().sequence, range(40))
+        assert len(set(sequences)) == 40
 
 
 # Faults
@@ -231,7 +182,7 @@ def test_two_threads_never_get_the_same_frame(server):
         ("stopped", CameraLostError, "was lost"),
         ("repeat", FrozenCameraError, "the same image"),
         ("small", FrameSizeError, "80 x 60 pixels, but 160 x 120"),
-        ("damaged", CameraTimeoutError, r"within 400 ms .the last one .* [1-9]\d* damaged"),
+        ("damaged", CameraTimeoutError, r"within 400 ms .[1-9]\d* damaged"),
     ],
 )
 def test_faults_are_named_until_they_end(server, mode, error, message):
@@ -243,9 +194,8 @@ def test_faults_are_named_until_they_end(server, mode, error, message):
         assert re.search(message, str(next_error(camera, error)))
         assert camera.is_connected != lost
         if lost:
-            for call in (camera.read_latest, lambda: camera.read(100)):  # a call during the loss waits for its own time
-                with pytest.raises(CameraLostError):
-                    call()
+            with pytest.raises(CameraLostError):
+                camera.read(100)  # a call during the loss waits for its own time
         server.mode = "live"
         if mode == "stopped":
             server.start()
@@ -255,49 +205,30 @@ def test_faults_are_named_until_they_end(server, mode, error, message):
         assert after.time_s > before.time_s
 
 
-def test_repeated_images_are_allowed_on_request(server):
-    with connected(server, frozen_after_s=None) as camera:
-        server.mode = "repeat"
+@pytest.mark.parametrize(("mode", "frozen_after_s"), [("repeat", None), ("black", 0.2)])
+def test_repeated_images_on_request_and_black_images_are_not_refused(server, mode, frozen_after_s):
+    with connected(server, frozen_after_s=frozen_after_s) as camera:
+        assert not camera.read().black
+        server.mode = mode
         first = camera.read()
         assert wait_until(lambda: camera.async_read().sequence > first.sequence + 60)  # longer than the default limit
         last = camera.read()
         assert np.array_equal(first.image, last.image)
-        assert last.repeats == 0
-
-
-def test_black_images_are_counted_and_not_refused(server):
-    with connected(server, frozen_after_s=0.2) as camera:
-        assert not camera.read().black
-        server.mode = "black"
-        assert wait_until(lambda: camera.async_read().black)
-        assert wait_until(lambda: camera.read().repeats > 20)  # longer than the limit
-        assert camera.read().black
+        assert (last.black, last.repeats > 20) == ((False, False) if mode == "repeat" else (True, True))
 
 
 def test_disconnect_ends_a_read_in_another_thread(server):
-    caught = []
-
-    def work():
-        try:
-            while True:
-                camera.read(60_000)
-        except CameraError as error:
-            caught.append(error)
-
-    camera = connected(server, timeout_s=1.0)
-    thread = threading.Thread(target=work)
-    thread.start()
-    server.mode = "stall"
-    camera.disconnect()
-    thread.join(SOON_S)
-    assert not thread.is_alive()
-    assert "not connected" in str(caught[0])
-    assert not camera_threads()
+    with concurrent.futures.ThreadPoolExecutor() as pool:
+        camera = connected(server, timeout_s=1.0)
+        reading = pool.submit(lambda: [camera.read(60_000) for _ in range(10_000)])
+        server.mode = "stall"
+        camera.disconnect()
+        assert "not connected" in str(reading.exception(SOON_S))
 
 
 def test_a_camera_connects_again_after_disconnect(server):
     camera = OpenCVCamera(config(server.url))
-    for _ in range(3):
+    for _ in range(2):
         assert camera.connect(warmup_s=0) is camera
         assert camera.is_connected
         assert camera.read().epoch == 0
@@ -306,7 +237,7 @@ def test_a_camera_connects_again_after_disconnect(server):
         camera.disconnect()
         camera.disconnect()
         assert not camera.is_connected
-        for call in (camera.read, camera.async_read, camera.read_latest):
+        for call in (camera.read, camera.async_read):
             with pytest.raises(CameraError, match=r"call connect\(\)"):
                 call()
 
@@ -341,11 +272,10 @@ def test_what_a_stream_cannot_do_is_named(server):
     ("changes", "message"),
     [
         ({"source": 987}, r"camera 987 cannot be opened: it is missing, .* Cameras found: "),
-        ({"source": "gone.avi"}, r"gone\.avi cannot be opened: it is missing"),
         ({"source": "/dev/null"}, r"/dev/null cannot be opened: .*group video, or it is no camera"),
         ({"source": "rtsp://user:secret@127.0.0.1:1/live", "timeout_s": 0.5}, "^rtsp://127.0.0.1:1/live cannot be"),
         ({"source": -1}, "index >= 0"),
-        ({"source": ""}, "source is empty"),
+        ({"source": ""}, "a path or a URL, got ''"),
         ({"height": None}, "both be None, got 160 x None"),
         ({"width": 0}, "width must be > 0 and finite, got 0"),
         ({"timeout_s": float("inf")}, "timeout_s must be > 0 and finite"),
@@ -360,28 +290,24 @@ def test_a_source_that_does_not_open_and_invalid_values_are_named(changes, messa
 # Devices
 
 
-class Driver:
-    """Properties of a V4L2 device in OpenCV. Values are whole, and ignored while the control is automatic."""
+class Device:
+    """A V4L2 device of OpenCV, which this test machine lacks. Unplugged, it returns no frames and cannot be opened.
 
-    def __init__(self, stuck=(), **values):
+    Values are whole, and the exposure is ignored while its control is automatic.
+    """
+
+    plugged, stuck = True, ()
+
+    def __init__(self, **values):
         self.values = {getattr(cv2, f"CAP_PROP_{name}"): value for name, value in values.items()}
-        self.stuck = {getattr(cv2, f"CAP_PROP_{name}") for name in stuck}
 
     def get(self, prop):
         return float(self.values.get(prop, -1))
 
     def set(self, prop, value):
         automatic = prop == cv2.CAP_PROP_EXPOSURE and self.values.get(cv2.CAP_PROP_AUTO_EXPOSURE) == 3
-        if prop not in self.values or prop in self.stuck or automatic:
-            return False
-        self.values[prop] = round(value)
-        return True
-
-
-class Device(Driver):
-    """A V4L2 device of OpenCV, which this test machine lacks. Unplugged, it returns no frames and cannot be opened."""
-
-    plugged = True
+        if prop in self.values and prop not in self.stuck and not automatic:
+            self.values[prop] = round(value)
 
     def isOpened(self):
         return self.plugged
@@ -432,24 +358,17 @@ def test_a_device_is_locked_after_its_warm_up_and_again_after_a_loss(device):
         assert [device.get(prop) for prop in (cv2.CAP_PROP_EXPOSURE, cv2.CAP_PROP_AUTO_WB)] == [70, 0]
 
 
-def test_a_device_that_refuses_a_setting_is_warned_about(device):
+def test_what_a_device_refuses_is_named_with_both_values(device):
     device.stuck = {cv2.CAP_PROP_AUTO_WB}
     with pytest.warns(UserWarning, match=r"camera 0 did not accept a setting. AUTO_WB: asked for 0, found 1"):
-        camera = OpenCVCamera(config(0, lock=True)).connect(warmup_s=0)
-    camera.disconnect()
-
-
-def test_a_device_without_the_size_names_both(device):
+        OpenCVCamera(config(0, lock=True)).connect(warmup_s=0).disconnect()
     device.stuck = {cv2.CAP_PROP_FRAME_WIDTH}
     device.values[cv2.CAP_PROP_FRAME_WIDTH] = 640
     with pytest.raises(FrameSizeError, match=r"640 x 120 pixels, but 160 x 120 .*v4l2-ctl -d /dev/video0"):
         OpenCVCamera(config(0)).connect()
-
-
-def test_a_refused_setting_is_named_with_both_values():
-    driver = Driver(stuck=["AUTO_EXPOSURE"], AUTO_EXPOSURE=3, EXPOSURE=157)
-    _, refused = opencv.lock(driver, {"exposure": 80.0, "focus": 3.0}, current=True)
-    assert list(refused.values()) == [
+    device = Device(AUTO_EXPOSURE=3, EXPOSURE=157)
+    device.stuck = {cv2.CAP_PROP_AUTO_EXPOSURE}
+    assert opencv.lock(device, {"exposure": 80.0, "focus": 3.0}, current=True)[1] == [
         "AUTO_EXPOSURE: asked for 1, found 3",
         "EXPOSURE: asked for 80, found 157",
         "AUTO_WB: asked for 0, the driver lacks it",
@@ -458,7 +377,7 @@ def test_a_refused_setting_is_named_with_both_values():
     ]
 
 
-def test_cameras_are_found_by_serial_number_port_and_number(tmp_path):
+def test_cameras_are_found_by_serial_number_and_number(tmp_path):
     dev, properties = tmp_path / "dev", tmp_path / "sys/class/video4linux"
     for number, index in ((0, 0), (1, 1), (2, 0), (10, 0)):
         (properties / f"video{number}").mkdir(parents=True)
@@ -466,11 +385,10 @@ def test_cameras_are_found_by_serial_number_port_and_number(tmp_path):
         (properties / f"video{number}/name").write_text(f"Camera {number}\n")
         dev.mkdir(exist_ok=True)
         (dev / f"video{number}").write_bytes(b"")
-    for folder, name, number in (("by-id", "usb-A_123", 0), ("by-path", "usb-0", 0), ("by-path", "usb-2", 2)):
-        (dev / "v4l" / folder).mkdir(parents=True, exist_ok=True)
-        (dev / "v4l" / folder / name).symlink_to(dev / f"video{number}")
+    (dev / "v4l/by-id").mkdir(parents=True)
+    (dev / "v4l/by-id/usb-A_123").symlink_to(dev / "video0")
     found = find_cameras(tmp_path)
-    assert [Path(camera.source).name for camera in found] == ["usb-A_123", "usb-2", "video10"]
-    assert str(found[1]).endswith("usb-2 (Camera 2)")
+    assert [Path(camera.source).name for camera in found] == ["usb-A_123", "video2", "video10"]
+    assert str(found[1]).endswith("video2 (Camera 2)")
     assert stable_path(str(dev / "video0"), tmp_path) == found[0].source
     assert stable_path(str(dev / "video2"), tmp_path) == str(dev / "video2")

@@ -9,7 +9,7 @@ from player import Player
 from benchmarks.instruments.peers import DARK, LIT, SIZE, SensorPeer
 from sts_jax import hardware, storage
 from sts_jax.hardware import Action, Stage
-from sts_jax.hardware.proof import Settling
+from sts_jax.hardware.sts import Settling
 
 GUIDE = hardware.GuideConfig(empty_s=0.2, hold_s=0.2, rest_s=0.4)
 SETTLING = Settling(visual_s=0.1, tactile_s=0.1)

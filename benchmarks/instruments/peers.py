@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from sts_jax.hardware import protocol, web
-from sts_jax.hardware.emulation import EmulatedController
+from sts_jax.hardware.protocol import EmulatedController
 
 SIZE = (160, 120)  # pixels, width and height
 _BITS, _COLUMNS = 16, 4

@@ -71,7 +71,7 @@ class Config:
 def check(config: Config) -> None:
     """Check the options before any work."""
     _ = config.source
-    hardware.sts.checked_levels(config.levels)
+    hardware.leds.checked_levels(config.levels)
     if config.pictures < FEWEST_IMAGES:
         raise ValueError(f"--pictures must be >= {FEWEST_IMAGES}, got {config.pictures}")
     if not 80 <= config.ruler <= 120:

@@ -19,7 +19,6 @@ from sts_jax.hardware.camera import Captured as Captured
 from sts_jax.hardware.camera import FoundCamera as FoundCamera
 from sts_jax.hardware.camera import FrameSizeError as FrameSizeError
 from sts_jax.hardware.camera import FrozenCameraError as FrozenCameraError
-from sts_jax.hardware.camera import StaleFrameError as StaleFrameError
 from sts_jax.hardware.camera import find_cameras as find_cameras
 from sts_jax.hardware.collecting import Action as Action
 from sts_jax.hardware.collecting import AutomaticPerson as AutomaticPerson
@@ -47,10 +46,6 @@ from sts_jax.hardware.lens import rectified as rectified
 from sts_jax.hardware.lens import relit as relit
 from sts_jax.hardware.lens import sensor_view as sensor_view
 from sts_jax.hardware.opencv import OpenCVCamera as OpenCVCamera
-from sts_jax.hardware.proof import LightError as LightError
-from sts_jax.hardware.proof import Pair as Pair
-from sts_jax.hardware.proof import Settling as Settling
-from sts_jax.hardware.proof import Shot as Shot
 from sts_jax.hardware.recording import Recorder as Recorder
 from sts_jax.hardware.recording import Replay as Replay
 from sts_jax.hardware.sensor_file import Device as Device
@@ -63,5 +58,9 @@ from sts_jax.hardware.session import list_recordings as list_recordings
 from sts_jax.hardware.session import load_recordings as load_recordings
 from sts_jax.hardware.session import next_recording as next_recording
 from sts_jax.hardware.sts import STS as STS
+from sts_jax.hardware.sts import LightError as LightError
+from sts_jax.hardware.sts import Pair as Pair
+from sts_jax.hardware.sts import Settling as Settling
+from sts_jax.hardware.sts import Shot as Shot
 from sts_jax.hardware.sts import brightness as brightness
 from sts_jax.hardware.sts import choose_exposure as choose_exposure

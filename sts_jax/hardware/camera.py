@@ -43,21 +43,13 @@ class FrozenCameraError(CameraError):
     """The camera has sent the same image for longer than `CameraConfig.frozen_after_s`."""
 
 
-class StaleFrameError(CameraError):
-    """The newest frame is older than the caller allows."""
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Captured:
-    """One frame of a camera.
-
-    A `sequence` number that is missing between two returned frames belongs to a frame that arrived and was not
-    returned, because it was damaged or replaced by a newer one.
-    """
+    """One frame of a camera."""
 
     image: UInt8[np.ndarray, "height width 3"]  # RGB, read-only, row 0 at the top
     time_s: float  # arrival of the frame on the clock `time.monotonic` (s), before it was decoded
-    sequence: int  # number of the frame since `connect`, starting at 0
+    sequence: int  # number of the frame since `connect`, from 0. Damaged and replaced frames count, too
     epoch: int = 0  # number of the connection, starting at 0. It increases when a lost device is found again
     dropped: int = 0  # frames lost just before this frame, estimated from the times
     repeats: int = 0  # number of identical frames just before this frame. 0 if the source may repeat frames
@@ -74,7 +66,6 @@ class Camera(Protocol):
     """A camera. Write a class with these methods to read a camera that OpenCV does not support, and pass it to `STS`.
 
     A backend whose driver can set the exposure also has `set_exposure(exposure) -> float | None`, see `OpenCVCamera`.
-    A camera that was lost raises a `CameraLostError` until it is found again.
     """
 
     @property
@@ -88,14 +79,11 @@ class Camera(Protocol):
     def connect(self, warmup_s: float = 1.0) -> object:
         """Open the camera, and after `warmup_s` (s) keep exposure, white balance and focus constant."""
 
-    def read(self, timeout_ms: float | None = None) -> Captured:
-        """Return a frame whose exposure began after the start of this call, or raise a `CameraTimeoutError`."""
-
     def async_read(self, timeout_ms: float | None = None) -> Captured:
-        """Return the oldest frame that was not returned yet, or wait for the next one."""
+        """Return the oldest frame that was not returned yet, or wait for the next one.
 
-    def read_latest(self, max_age_ms: float = 500.0) -> Captured:
-        """Return the newest frame without waiting, or raise a `StaleFrameError`."""
+        A camera that was lost raises a `CameraLostError` until it is found again.
+        """
 
     def disconnect(self) -> None:
         """Close the camera."""
@@ -103,12 +91,10 @@ class Camera(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class CameraConfig:
-    """The configuration of an `OpenCVCamera`.
+    """The configuration of an `OpenCVCamera`."""
 
-    Prefer a path in `/dev/v4l/by-id` to an index, because indices change when devices are replugged.
-    """
-
-    source: int | str | Path  # index or path of a V4L2 device, or URL of a stream (motion JPEG over HTTP, or RTSP)
+    # Index or path of a V4L2 device (best in /dev/v4l/by-id), or URL of a stream (motion JPEG over HTTP, or RTSP)
+    source: int | str | Path
     width: int | None = 1640  # width of the images (pixels), None: the width that the source sends
     height: int | None = 1232  # height of the images (pixels), None: the height that the source sends
     fps: float | None = None  # frame rate of a device (frames per second), None: unchanged
@@ -122,10 +108,8 @@ class CameraConfig:
     frozen_after_s: float | None = 1.0  # time of identical frames after which reading raises an error (s), None: never
 
     def __post_init__(self) -> None:
-        if isinstance(self.source, bool) or (isinstance(self.source, int) and self.source < 0):
-            raise ValueError(f"source must be a device's index >= 0, a path or a URL, got {self.source!r}")
-        if str(self.source) in ("", "."):
-            raise ValueError("source is empty: give a device's index, a path or a URL")
+        if str(self.source) in ("", ".") or (isinstance(self.source, int) and self.source < 0):
+            raise ValueError(f"source must be a device's index >= 0, a path or a URL, got {str(self.source)!r}")
         if (self.width is None) != (self.height is None):
             raise ValueError(f"width and height must both be given or both be None, got {self.width} x {self.height}")
         for name in ("width", "height", "fps", "timeout_s", "buffer", "frozen_after_s"):
@@ -164,10 +148,9 @@ class _Gap(NamedTuple):
 
 
 class Pace:
-    """Measures the period of a camera's frames, and estimates how many frames were lost.
+    """Measures the period of a camera's frames, and counts n lost frames after an interval of n + 1 periods.
 
-    After an interval of n + 1 periods, n frames count as lost. Frames that follow in less than one period were only
-    late, and reduce `dropped`.
+    Frames that follow in less than one period were only late, and reduce `dropped`.
     """
 
     def __init__(self, nominal: float | None):
@@ -196,10 +179,10 @@ class Pace:
             return 0
         periods = (time_s - last) / period
         self.delayed = periods > _LONG or (self.delayed and periods < _SHORT)
-        late_together = self.delayed and periods < _SHORT and self._gap is not None
-        if not late_together:  # the intervals between frames that a network held back are not those of the camera
+        if not (self.delayed and periods < _SHORT and self._gap is not None):
+            # the intervals between frames that a network held back are not those of the camera
             self._intervals.append(time_s - last)
-        missing = max(round((time_s - last) / period) - 1, 0)
+        missing = max(round(periods) - 1, 0)
         if missing:
             self._gap = _Gap(last, 1, missing, missing + _MADE_UP)
             self.dropped += missing
@@ -231,33 +214,22 @@ class FoundCamera:
 
 
 def find_cameras(root: Path = Path("/")) -> list[FoundCamera]:
-    """List the V4L2 cameras of this machine by number. The list is empty on other systems than Linux.
-
-    The `source` of a camera is its path in `/dev/v4l/by-id`, which contains the serial number, else its path in
-    `/dev/v4l/by-path`, which contains the USB port, else the path of the device itself.
-    """
-    links = _links("by-path", root) | _links("by-id", root)
+    """List the V4L2 cameras of this machine by number. The list is empty on other systems than Linux."""
     cameras = []
     for device in sorted((root / "dev").glob("video[0-9]*"), key=lambda path: (len(path.name), path.name)):
         properties = root / "sys/class/video4linux" / device.name
         if _text(properties / "index") in ("", "0"):  # the others deliver a camera's metadata
-            source = links.get(device.resolve(), device)
-            cameras.append(FoundCamera(str(source), _text(properties / "name") or "unnamed"))
+            cameras.append(FoundCamera(stable_path(str(device), root), _text(properties / "name") or "unnamed"))
     return cameras
 
 
 def stable_path(device: str, root: Path = Path("/")) -> str:
     """Return the path of a device in `/dev/v4l/by-id`, which survives replugging, or `device` if there is none."""
-    return str(_links("by-id", root).get(Path(device).resolve(), device))
-
-
-def _links(folder: str, root: Path) -> dict[Path, Path]:
-    """The first symbolic link of each device in a folder of `/dev/v4l`."""
-    return {link.resolve(): link for link in sorted((root / "dev/v4l" / folder).glob("*"), reverse=True)}
+    links = sorted((root / "dev/v4l/by-id").glob("*"))
+    return next((str(link) for link in links if link.resolve() == Path(device).resolve()), device)
 
 
 def _text(path: Path) -> str:
-    """The text of a small file, or an empty string if it cannot be read."""
     with contextlib.suppress(OSError):
         return path.read_text(errors="replace").strip()
     return ""

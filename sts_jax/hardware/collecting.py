@@ -20,8 +20,8 @@ from jaxtyping import Float
 
 from sts_jax.hardware.camera import CameraError
 from sts_jax.hardware.leds import LedError
-from sts_jax.hardware.proof import LightError, Pair, thumbnail
 from sts_jax.hardware.session import End, Image, Session
+from sts_jax.hardware.sts import LightError, Pair, thumbnail
 
 Blocks = Float[np.ndarray, "24 32 3"]  # means of an image's blocks, 0 to 255
 SmallBlocks = Float[np.ndarray, "48 64 3"]  # means of blocks of half the width and height, 0 to 255

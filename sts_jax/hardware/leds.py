@@ -5,7 +5,6 @@ import dataclasses
 import errno
 import functools
 import logging
-import operator
 import os
 import random
 import threading
@@ -22,7 +21,6 @@ from sts_jax.hardware import protocol
 READ_S = 0.02  # longest wait of one read (s)
 WRITE_S = 0.2  # longest wait of one write (s)
 REPEAT_S = 0.1  # wait for an answer before the request is repeated (s). A controller answers within 15 ms
-_HEARD = 400  # largest number of invalid bytes that are kept for an error message
 _FIRST_WAIT_S = 0.1  # between the first two attempts of `reconnect`. It doubles after each attempt
 _LONGEST_WAIT_S = 5.0
 
@@ -75,54 +73,32 @@ class Leds:
 
     Several threads may use one `Leds`. The controller's watchdog turns the lights off after `watchdog_ms` without a
     request, so they go off if this process ends or hangs. A thread sends a request after each third of this time.
-
-    A request takes at most `answer_s`, and 0.3 s more if the port accepts no bytes or sends bytes without end. The
-    first request after a restart of the controller takes at most twice as long.
     """
 
-    def __init__(
-        self, connection: "Connection", *, answer_s: float = 1.0, watchdog_ms: int = protocol.DEFAULT_WATCH_MS
-    ):
+    def __init__(self, connection: "Connection", answer_s: float = 1.0, watchdog_ms: int = protocol.DEFAULT_WATCH_MS):
         """Use `Leds.connect`."""
-        self._answer_s = answer_s
-        self._watchdog_ms = watchdog_ms
+        self._answer_s, self._watchdog_ms = answer_s, watchdog_ms
         self._start(connection)
 
     @classmethod
     def connect(
-        cls,
-        port: str,
-        *,
-        timeout_s: float = 5.0,
-        answer_s: float = 1.0,
-        watchdog_ms: int = protocol.DEFAULT_WATCH_MS,
+        cls, port: str, *, timeout_s: float = 5.0, answer_s: float = 1.0, watchdog_ms: int = protocol.DEFAULT_WATCH_MS
     ) -> "Leds":
         """Connect to the controller on a port and turn its lights off. This restarts most boards, for up to 2 s.
 
         Args:
             port: Name of the device, such as `/dev/ttyACM0`, or a URL of pyserial.
             timeout_s: Longest wait for the controller's first answer (s).
-            answer_s: Longest time of each later request, with all its repetitions (s).
+            answer_s: Longest time of each later request, with all its repetitions (s). The first request after a
+                restart of the controller takes at most twice as long.
             watchdog_ms: Time without requests after which the controller turns its lights off, 100 to 10000 (ms).
         """
-        if not protocol.SHORTEST_WATCH_MS <= watchdog_ms <= protocol.LONGEST_WATCH_MS:
-            raise ValueError(
-                f"watchdog_ms must be in {protocol.SHORTEST_WATCH_MS}..{protocol.LONGEST_WATCH_MS}, got {watchdog_ms}"
-            )
-        for name, value in (("timeout_s", timeout_s), ("answer_s", answer_s)):
-            if not 0 < value < float("inf"):
-                raise ValueError(f"{name} must be positive and finite, got {value}")
-        return cls(Connection(port, timeout_s), answer_s=answer_s, watchdog_ms=watchdog_ms)
+        return cls(Connection(port, timeout_s), answer_s, watchdog_ms)
 
     @classmethod
     def find(cls, serial_number: str) -> "Leds":
-        """Open the USB ports one after the other until the controller with a serial number answers.
-
-        Some boards have the serial number in their USB descriptor, too. Their ports are tried first.
-        """
-        ports = [port for port in find_controllers() if port.vid is not None]
-        ports.sort(key=lambda port: port.serial_number != serial_number)
-        return cls(_search([port.device for port in ports], serial_number, timeout_s=5.0))
+        """Open the USB ports one after the other until the controller with a serial number answers."""
+        return cls(_search(_usb_ports(serial_number), serial_number, timeout_s=5.0))
 
     @property
     def port(self) -> str:
@@ -140,14 +116,9 @@ class Leds:
         return self.controller.serial_number
 
     def set(self, levels: Sequence[int]) -> Lit:
-        """Set the lights and wait until the controller has applied the levels.
+        """Set the duty cycles of the four channels, 0 (off) to 255, and wait until the controller has applied them.
 
-        Args:
-            levels: Duty cycles of the four light channels, integers from 0 (off) to 255 (always on).
-
-        Raises:
-            LedTimeoutError: No valid answer arrived within `answer_s`. It is unknown whether the lights changed.
-            DisconnectedError: The port vanished or is closed.
+        After a `LedTimeoutError`, it is unknown whether the lights changed.
         """
         checked = checked_levels(levels)
         lit = self._state(functools.partial(protocol.Set, levels=checked))
@@ -172,19 +143,16 @@ class Leds:
     def reconnect(self, *, limit_s: float = 30.0) -> None:
         """Search for the controller after its port has vanished, connect to it again, and turn its lights off.
 
-        The controller is recognised by its serial number. The previous port is tried first, then all other ports with
-        the USB vendor ID and product ID of the controller. Requests of other threads raise `DisconnectedError`.
-
-        Args:
-            limit_s: Time after which no further attempt begins (s). An attempt takes at most `timeout_s + 2 * answer_s`
-                for each port.
+        It is recognised by its serial number, on the previous port or on another one with the same USB vendor and
+        product ID. No attempt begins after `limit_s` (s). Requests of other threads raise a `DisconnectedError`.
         """
         self._stop()
         deadline, wait = time.monotonic() + limit_s, _FIRST_WAIT_S
         last = self._connection
         while True:
             try:
-                connection = _search(self._candidates(), self.serial_number, last.timeout_s)
+                ports = [last.name, *(_usb_ports(last.usb.serial_number, last.usb) if last.usb else [])]
+                connection = _search(list(dict.fromkeys(ports)), self.serial_number, last.timeout_s)
                 connection.usb = connection.usb or last.usb
                 self._start(connection)
                 return
@@ -232,26 +200,22 @@ class Leds:
         connection = self._connection
         wait = period_s = self._watchdog_ms / 3000
         while not connection.stopped.wait(wait):
-            wait = period_s - (time.monotonic() - connection.answered_s)
-            if wait > 0:
-                continue
-            wait = period_s
             try:
-                self.ping()
+                if time.monotonic() - connection.answered_s >= period_s:
+                    self.ping()
+                wait = period_s - (time.monotonic() - connection.answered_s)
             except LedError as error:
                 _log.warning("%s", error)
                 if isinstance(error, DisconnectedError):
                     return
                 wait = 0.0
 
-    def _candidates(self) -> list[str]:
-        """The names of the ports on which `reconnect` searches for the controller, in order."""
-        names = [self.port]
-        if (usb := self._connection.usb) is not None:
-            alike = [port for port in find_controllers() if (port.vid, port.pid) == (usb.vid, usb.pid)]
-            alike.sort(key=lambda port: port.serial_number != usb.serial_number)
-            names += [port.device for port in alike]
-        return list(dict.fromkeys(names))
+
+def _usb_ports(serial_number: str | None, like: ListPortInfo | None = None) -> list[str]:
+    """USB ports, only those with the IDs of another port if it is given. Some boards show their serial number here."""
+    ports = [port for port in find_controllers() if port.vid is not None]
+    alike = [port for port in ports if like is None or (port.vid, port.pid) == (like.vid, like.pid)]
+    return [port.device for port in sorted(alike, key=lambda port: port.serial_number != serial_number)]
 
 
 def _search(ports: Sequence[str], serial_number: str, timeout_s: float) -> "Connection":
@@ -277,7 +241,7 @@ class Connection:
     """An open serial port to the LED controller. Several threads may use one connection."""
 
     def __init__(self, name: str, timeout_s: float):
-        """Open the port, and wait for at most `timeout_s` for the description of the controller."""
+        """Open the port, and wait for at most `timeout_s` (s) for the description of the controller."""
         self.name, self.timeout_s = name, timeout_s
         self.usb = _usb_port(name)
         self.answered_s = time.monotonic()  # time of the last valid answer (s)
@@ -287,7 +251,7 @@ class Connection:
         # Random, so that late answers to an earlier process have other sequence numbers.
         self._sequence = random.randrange(protocol.LAST_SEQUENCE)
         self._buffer = b""  # received bytes that are not processed yet
-        self._heard = b""  # invalid lines that arrived during the current exchange
+        self._heard = b""  # the last invalid line that arrived during the current exchange
         try:
             self.controller, _, _ = self.exchange(protocol.Hello, protocol.Controller, timeout_s=timeout_s)
             if self.controller.version != protocol.VERSION:
@@ -295,9 +259,6 @@ class Connection:
                     f"the LED controller on {name} uses version {self.controller.version} of the protocol instead of "
                     f"{protocol.VERSION}. {_FLASH}"
                 )
-        except LedTimeoutError as error:
-            self.close()
-            raise LedError(f"no LED controller answered on {name}: {error}") from error
         except BaseException:
             self.close()
             raise
@@ -307,10 +268,8 @@ class Connection:
     ) -> tuple[Answer, float, float]:
         """Send a request, and repeat it with the same sequence number every 0.1 s until its answer arrives.
 
-        The controller executes it only once. Damaged lines and answers to other requests are ignored.
-
-        Returns:
-            The answer, the time before the request was first sent, and the time of the answer (`time.monotonic`, s).
+        The controller executes it only once. Damaged lines and answers to other requests are ignored. Returns the
+        answer, the time before the request was first sent, and the time of the answer (`time.monotonic`, s).
         """
         with self._lock:
             self._sequence = self._sequence % protocol.LAST_SEQUENCE + 1
@@ -331,20 +290,16 @@ class Connection:
                     if isinstance(reply, answer):
                         self.answered_s = time.monotonic()
                         return reply, sent_s, self.answered_s
-            heard = self._heard + self._buffer
             hint = "Nothing was received: check the cable and the name of the port, and flash the firmware."
-            if heard:
+            if heard := self._heard or self._buffer:
                 hint = f"Received {heard[:80]!r}: another device may be on this port."
             raise LedTimeoutError(f"no valid answer to {line!r} from {self.name} within {timeout_s:g} s. {hint}")
 
     def close(self) -> None:
         """Close the port. No more requests arrive, so the controller's watchdog turns the lights off."""
         self.stopped.set()
-        with self._lock:
-            try:
-                self._serial.close()
-            except OSError as error:
-                _log.debug("closing %s: %s", self.name, error)
+        with self._lock, contextlib.suppress(OSError):
+            self._serial.close()
 
     def _next_reply(self, until: float) -> protocol.Reply | None:
         """The next valid reply, or None if none arrives until a time. Skips invalid lines and the watchdog's lines."""
@@ -353,14 +308,12 @@ class Connection:
                 return None
             try:
                 reply = protocol.decode_reply(line)
-            except protocol.ProtocolError as error:
-                self._heard = (self._heard + line)[:_HEARD]
-                _log.debug("%s: %s", self.name, error)
+            except protocol.ProtocolError:
+                self._heard = line
                 continue
-            if isinstance(reply, protocol.TurnedOff):
-                _log.warning("the watchdog of the LED controller on %s turned the lights off", self.name)
-                continue
-            return reply
+            if not isinstance(reply, protocol.TurnedOff):
+                return reply
+            _log.warning("the watchdog of the LED controller on %s turned the lights off", self.name)
         return None
 
     def _next_line(self, until: float) -> bytes | None:
@@ -382,9 +335,8 @@ class Connection:
         # pyserial also reports a timeout for a line that it has sent, if the operating system suspended the process in
         # between. This happens on a busy computer. A line that was not sent gets no answer.
         try:
-            self._serial.write(line)
-        except serial.SerialTimeoutException as error:
-            _log.debug("%s: %s", self.name, error)
+            with contextlib.suppress(serial.SerialTimeoutException):
+                self._serial.write(line)
         except (OSError, TypeError) as error:
             raise self._vanished(error) from error
 
@@ -424,10 +376,7 @@ def _usb_port(name: str) -> ListPortInfo | None:
 
 def checked_levels(levels: Sequence[int]) -> protocol.Levels:
     """Return levels as a tuple of four integers from 0 to 255."""
-    try:
-        first, second, third, fourth = checked = tuple(operator.index(level) for level in levels)
-    except (TypeError, ValueError):
-        checked = ()
-    if not checked or not all(0 <= level <= 255 for level in checked):
+    if len(levels) != protocol.CHANNELS or not all(level in range(256) for level in levels):
         raise ValueError(f"levels must be {protocol.CHANNELS} integers in 0..255, got {levels!r}")
+    first, second, third, fourth = map(int, levels)
     return first, second, third, fourth

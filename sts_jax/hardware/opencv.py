@@ -5,7 +5,6 @@ import collections
 import dataclasses
 import math
 import os
-import sys
 import threading
 import time
 import warnings
@@ -26,7 +25,6 @@ from sts_jax.hardware.camera import (
     FrameSizeError,
     FrozenCameraError,
     Pace,
-    StaleFrameError,
     find_cameras,
     public,
     stable_path,
@@ -39,7 +37,6 @@ _IN_FLIGHT = 2  # frames that may be in exposure or transfer at once. `read` dis
 _MJPG = cv2.VideoWriter.fourcc(*"MJPG")
 _TAIL = 1024  # bytes within which a complete JPEG image ends with its marker
 _RATE_TOLERANCE = 0.02  # share by which a driver may round the frame rate
-
 
 # Field of `CameraConfig`, OpenCV's property, the property of its automatic control, and the value that turns this off
 _SETTINGS: tuple[tuple[str, str, str, float], ...] = (
@@ -73,8 +70,7 @@ class OpenCVCamera:
     ```
 
     A background thread fetches the frames continuously, so that no old frames wait in the driver. Only this thread
-    uses OpenCV. If a device or stream is lost, the thread opens it again under the same path or URL. Several threads
-    may use one camera. `async_read` then returns each frame to only one of them.
+    uses OpenCV, and it opens a lost source again. Several threads may use one camera: each frame goes to one of them.
     """
 
     def __init__(self, config: CameraConfig):
@@ -89,15 +85,15 @@ class OpenCVCamera:
     def _reset(self) -> None:
         self._queue: collections.deque[Captured] = collections.deque()
         self._newest: Captured | None = None
-        self._problem: tuple[type[CameraError], str] | None = None  # why there are no frames at present
+        self._problem: CameraError | None = None  # why there are no frames at present
         self._counts = CameraStatistics()
         self._pace = Pace(self.config.fps)
         self._next = 0  # sequence number of the next frame
         self._epoch = -1
         self._task: Callable[[Capture], None] | None = None  # to be done on the open device after the next frame
         # Locked settings, by field of `CameraConfig`. At first, these are the requested ones
-        wanted = {field: getattr(self.config, field) for field, *_ in _SETTINGS if self.config.kind == "device"}
-        self._held: dict[str, float] = {field: value for field, value in wanted.items() if value is not None}
+        wanted = [(field, getattr(self.config, field)) for field, *_ in _SETTINGS if self.config.kind == "device"]
+        self._held: dict[str, float] = {field: value for field, value in wanted if value is not None}
         self._refused: list[str] = []  # settings that the driver did not accept
 
     def connect(self, warmup_s: float = 1.0) -> "OpenCVCamera":
@@ -116,15 +112,15 @@ class OpenCVCamera:
                 if self._newest is None:
                     raise self._error(3 * config.timeout_s)
             time.sleep(warmup_s)
-            if config.kind == "device" and config.lock:
+            if config.lock and config.kind == "device":
                 self._between_frames(self._lock_all)
                 with self._changed:
                     self._queue.clear()
             elif config.lock:
-                self._refused.append(
+                self._refused = [
                     "AUTO_EXPOSURE and AUTO_WB of a stream cannot be turned off from here: lock exposure and white "
                     "balance at its server, then pass lock=False in CameraConfig"
-                )
+                ]
             for text in self._refused:
                 warnings.warn(f"{config.name} did not accept a setting. {text}.", stacklevel=2)
         except BaseException:  # includes a warning that Python turns into an error
@@ -143,6 +139,12 @@ class OpenCVCamera:
             if self._thread.is_alive():
                 warnings.warn(f"the driver of {self.config.name} does not respond. It is closed later.", stacklevel=2)
 
+    def __enter__(self) -> "OpenCVCamera":
+        return self.connect() if self._stop.is_set() else self
+
+    def __exit__(self, *error: object) -> None:
+        self.disconnect()
+
     @property
     def is_connected(self) -> bool:
         """True if the camera is open and not lost."""
@@ -156,7 +158,7 @@ class OpenCVCamera:
 
     @property
     def source(self) -> str:
-        """The identity of the camera: its path, with the serial number if there is one, or the URL without password."""
+        """The path of the camera, with the serial number if there is one, or the URL without password."""
         return stable_path(self.config.path) if self.config.kind == "device" else public(self.config.path)
 
     @property
@@ -165,13 +167,9 @@ class OpenCVCamera:
         return dict(self._held)
 
     def set_exposure(self, exposure: float) -> float | None:
-        """Set the exposure as soon as the next frame has arrived. It appears in the images a few frames later.
+        """Set the exposure in the driver's unit (V4L2: 0.1 ms). It appears in the images a few frames later.
 
-        Args:
-            exposure: Exposure in the driver's unit (V4L2: 0.1 ms).
-
-        Returns:
-            The exposure that the device has now, which drivers round and limit. None: the driver supports none.
+        Returns the exposure that the device has now, which drivers round and limit. None: the driver supports none.
         """
         if not exposure > 0:
             raise ValueError(f"exposure must be > 0, got {exposure}")
@@ -179,16 +177,14 @@ class OpenCVCamera:
             raise CameraError(f"{self.config.name} is a stream: set the exposure at its server.")
 
         def task(capture: Capture) -> None:
-            held, refused = lock(capture.device, {"exposure": exposure})
             self._held.pop("exposure", None)
-            if "AUTO_EXPOSURE" not in refused:
-                self._held.update(held)
+            self._held |= lock(capture.device, {"exposure": exposure})[0]
 
         self._between_frames(task)
         return self._held.get("exposure")
 
     def read(self, timeout_ms: float | None = None) -> Captured:
-        """See `Camera.read`. The first two frames that arrive after the start of the call are discarded."""
+        """Return a frame whose exposure began after the start of this call: the third that arrives."""
         with self._changed:
             first = self._next + _IN_FLIGHT
             return self._wait(timeout_ms, lambda frame: frame.sequence >= first and not frame.delayed)
@@ -197,19 +193,6 @@ class OpenCVCamera:
         """See `Camera.async_read`. The newest `CameraConfig.buffer` frames are kept."""
         with self._changed:
             return self._wait(timeout_ms, lambda frame: True)
-
-    def read_latest(self, max_age_ms: float = 500.0) -> Captured:
-        """See `Camera.read_latest`. The same frame may be returned several times."""
-        with self._changed:
-            if self._newest is None or self._problem is not None or self._stop.is_set():
-                raise self._error(0.0)
-            frame = self._newest
-        age_ms = 1000 * (time.monotonic() - frame.time_s)
-        if age_ms > max_age_ms:
-            raise StaleFrameError(
-                f"the newest frame of {self.config.name} is {age_ms:.0f} ms old, max_age_ms={max_age_ms:g}"
-            )
-        return frame
 
     def _wait(self, timeout_ms: float | None, wanted: Callable[[Captured], bool]) -> Captured:
         """Return the next wanted frame of the queue, and discard those before it."""
@@ -221,11 +204,10 @@ class OpenCVCamera:
                 if wanted(frame := self._queue.popleft()):
                     return frame
             remaining = deadline - time.monotonic()
-            if self._stop.is_set() or (self._problem is not None and not (lost_before and self._is_lost())):
-                raise self._error(limit_s)
-            if self._epoch != epoch and not lost_before:
+            failed = self._problem is not None and not (lost_before and self._is_lost())
+            if self._epoch != epoch and not lost_before and not failed and not self._stop.is_set():
                 raise CameraLostError(f"{self.config.name} was lost during the call and found again: repeat the call.")
-            if remaining <= 0:
+            if self._stop.is_set() or failed or remaining <= 0:
                 raise self._error(limit_s)
             self._changed.wait(remaining)
 
@@ -238,29 +220,23 @@ class OpenCVCamera:
                 self._task = None
                 raise self._error(self.config.timeout_s)
 
+    def _lock_all(self, capture: "Capture") -> None:
+        self._held, refused = lock(capture.device, self._held, current=True)
+        self._refused = capture.warnings + refused
+
     def _is_lost(self) -> bool:
-        return self._problem is not None and self._problem[0] is CameraLostError
+        return isinstance(self._problem, CameraLostError)
 
     def _error(self, limit_s: float) -> CameraError:
         """The reason why there is no frame."""
         if self._stop.is_set():
             return CameraError(f"{self.config.name} is not connected: call connect() first.")
         if self._problem is not None:
-            kind, message = self._problem
-            return kind(message)
-        age = "none has arrived"
-        if self._newest is not None:
-            age = f"the last one arrived {time.monotonic() - self._newest.time_s:.2f} s ago"
+            return type(self._problem)(*self._problem.args)
         return CameraTimeoutError(
-            f"{self.config.name} has sent no usable frame within {1000 * limit_s:.0f} ms ({age}, "
-            f"{self._counts.damaged} damaged frames since connect): check the device, or the stream's server."
+            f"{self.config.name} has sent no usable frame within {1000 * limit_s:.0f} ms ({self._counts.damaged} "
+            "damaged frames since connect): check the device, or the stream's server."
         )
-
-    def __enter__(self) -> "OpenCVCamera":
-        return self.connect() if self._stop.is_set() else self
-
-    def __exit__(self, *error: object) -> None:
-        self.disconnect()
 
     # The thread
 
@@ -276,9 +252,9 @@ class OpenCVCamera:
                 finally:
                     capture.device.release()
         except CameraError as error:
-            self._set_problem(type(error), str(error))
+            self._fail(error)
         except Exception as error:  # an error that ends the thread must reach the caller, who would wait otherwise
-            self._set_problem(CameraError, f"{config.name} failed ({error!r}): call disconnect(), then connect().")
+            self._fail(CameraError(f"{config.name} failed ({error!r}): call disconnect(), then connect()."))
 
     def _open(self, config: CameraConfig) -> "Capture | None":
         """Open the source, or return None after `disconnect`. A source that was open before is tried until it opens."""
@@ -289,17 +265,14 @@ class OpenCVCamera:
             except CameraError as error:
                 if self._epoch < 0:
                     raise
-                self._set_problem(CameraLostError, f"{_lost(config)} The last attempt: {error}")
+                self._fail(_lost(config, f" The last attempt: {error}"))
                 self._stop.wait(wait_s)
                 wait_s = min(2 * wait_s, LONGEST_WAIT_S)
                 continue
             with self._changed:
-                self._refused = list(capture.warnings)
-                if self._held:  # a device forgets its settings without power
-                    self._refused += lock(capture.device, self._held)[1].values()
-                if self._epoch < 0:
-                    self._pace = Pace(config.fps or capture.rate)
-                else:
+                # A device forgets its settings without power.
+                self._refused = capture.warnings + lock(capture.device, self._held)[1]
+                if self._epoch >= 0:
                     self._pace.interrupted()
                 self._epoch += 1
             return capture
@@ -325,9 +298,11 @@ class OpenCVCamera:
                 self._counts.damaged += 1
                 continue
             if image.shape[1::-1] != capture.size:
-                self._set_problem(FrameSizeError, _size_message(config, image.shape[1::-1], capture.size))
+                self._fail(_wrong_size(config, image.shape[1::-1], capture.size))
                 continue
-            if previous is not None and _identical(image, previous.image):
+            # The first row is compared first, because it nearly always differs.
+            same = previous is not None and np.array_equal(image[0], previous.image[0])
+            if previous is not None and same and np.array_equal(image, previous.image):
                 repeats += 1
             else:
                 repeats, same_since = 0, time_s
@@ -336,9 +311,8 @@ class OpenCVCamera:
             counted = 0 if limit_s is None else repeats
             frame = previous = Captured(image, time_s, sequence, self._epoch, dropped, counted, delayed)
             if counted and not frame.black and limit_s is not None and time_s - same_since > limit_s:
-                message = f"{config.name} has sent the same image for {time_s - same_since:.1f} s"
                 remedy = "replug it or restart its server, or set frozen_after_s=None if it may repeat images"
-                self._set_problem(FrozenCameraError, f"{message}: {remedy}.")
+                self._fail(FrozenCameraError(f"{config.name} has sent the same image for {limit_s:g} s: {remedy}."))
                 continue
             self._publish(frame)
             if (task := self._task) is not None:
@@ -347,7 +321,7 @@ class OpenCVCamera:
                     self._task = None
                     self._changed.notify_all()
         if not self._stop.is_set():
-            self._set_problem(CameraLostError, _lost(config))
+            self._fail(_lost(config))
             self._stop.wait(FIRST_WAIT_S)
 
     def _publish(self, frame: Captured) -> None:
@@ -360,59 +334,65 @@ class OpenCVCamera:
             self._newest, self._problem = frame, None
             self._changed.notify_all()
 
-    def _set_problem(self, error: type[CameraError], message: str) -> None:
+    def _fail(self, problem: CameraError) -> None:
         with self._changed:
-            self._problem = error, message
+            self._problem = problem
             self._queue.clear()
             self._changed.notify_all()
 
-    def _lock_all(self, capture: "Capture") -> None:
-        self._held, refused = lock(capture.device, self._held, current=True)
-        self._refused = capture.warnings + list(refused.values())
+
+def _lost(config: CameraConfig, attempt: str = "") -> CameraLostError:
+    return CameraLostError(
+        f"{config.name} was lost, and a thread tries to open it again: check its cable or its server.{attempt}"
+    )
 
 
-def _lost(config: CameraConfig) -> str:
-    return f"{config.name} was lost, and a thread tries to open it again: check its cable or its server."
+def _wrong_size(config: CameraConfig, size: tuple[int, ...], wanted: tuple[int, ...]) -> FrameSizeError:
+    return FrameSizeError(
+        f"{config.name} sends frames of {size[0]} x {size[1]} pixels, but {wanted[0]} x {wanted[1]} were asked for: "
+        f"give CameraConfig a size that it sends (`v4l2-ctl -d {config.path} --list-formats-ext` lists those of a "
+        "device, and some need fourcc='MJPG')."
+    )
 
 
 class Capture:
     """A device or a stream that is open for reading.
 
-    If the size of a stream's frames changes, FFmpeg rescales the frames, and OpenCV does not report the change. This
-    class therefore decodes the frames of motion JPEG streams itself, keeps their size and rejects incomplete frames.
+    FFmpeg rescales the frames of a stream whose size changes, and OpenCV does not report this. The frames of motion
+    JPEG streams are therefore decoded here, which keeps their size and shows incomplete frames.
     """
 
     def __init__(self, config: CameraConfig):
         """Open the source."""
-        self._config = config
+        self._is_device = config.kind == "device"
         self.device = _open(config)
         self.warnings: list[str] = []  # requests that the driver did not accept
         self._jpeg = False
         try:
             if not self.device.isOpened():
                 remedy = "check the address, the path and the password, and that its server sends video."
-                if config.kind == "device":
+                if self._is_device:
                     remedy = (
                         f"it is missing, in use (`fuser {config.path}`), your user is not in the group video, or it is "
                         f"no camera. Cameras found: {', '.join(map(str, find_cameras())) or 'none'}."
                     )
                 raise CameraError(f"{config.name} cannot be opened: {remedy}")
-            if config.kind == "device":
-                self._request_format()
+            if self._is_device:
+                self._request_format(config)
             elif self._fourcc() == _MJPG:
                 self._jpeg = self.device.set(cv2.CAP_PROP_FORMAT, -1)
             sides = cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT
             self.size = tuple(round(self.device.get(side)) for side in sides)
             wanted = config.width or self.size[0], config.height or self.size[1]
             if self.size != wanted:
-                raise FrameSizeError(_size_message(config, self.size, wanted))
+                raise _wrong_size(config, self.size, wanted)
         except BaseException:
             self.device.release()
             raise
 
-    def _request_format(self) -> None:
+    def _request_format(self, config: CameraConfig) -> None:
         """Request the format, the size and the frame rate of a device."""
-        config, device = self._config, self.device
+        device = self.device
         if config.fourcc is not None:
             device.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*config.fourcc))
             fourcc = self._fourcc().to_bytes(4, "little").decode(errors="replace")
@@ -430,15 +410,9 @@ class Capture:
     def _fourcc(self) -> int:
         return int(self.device.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF
 
-    @property
-    def rate(self) -> float | None:
-        """Frames per second of a device, or None if unknown, as for a stream."""
-        rate = self.device.get(cv2.CAP_PROP_FPS) if self._config.kind == "device" else 0.0
-        return rate if rate > 0 and np.isfinite(rate) else None
-
     def stamp(self) -> float | None:
         """Time of the last frame on the clock of the device's driver (s), which has no jitter. None for a stream."""
-        time_ms = self.device.get(cv2.CAP_PROP_POS_MSEC) if self._config.kind == "device" else 0.0
+        time_ms = self.device.get(cv2.CAP_PROP_POS_MSEC) if self._is_device else 0.0
         return time_ms / 1000 if time_ms > 0 else None
 
     def grab(self) -> bool:
@@ -466,68 +440,44 @@ class Capture:
 
 def _open(config: CameraConfig) -> cv2.VideoCapture:
     if config.kind == "device":
-        if sys.platform == "linux":
-            # OpenCV reads this variable at its first frame. Without it, a stalled device blocks for 10 s.
-            os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", str(math.ceil(config.timeout_s)))
-            return cv2.VideoCapture(config.path, cv2.CAP_V4L2)
-        number = str(config.source)
-        return cv2.VideoCapture(int(number) if number.isdecimal() else number, cv2.CAP_ANY)
+        # OpenCV reads this variable at its first frame. Without it, a stalled device blocks for 10 s.
+        os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", str(math.ceil(config.timeout_s)))
+        return cv2.VideoCapture(config.path, cv2.CAP_V4L2)
     milliseconds = round(1000 * config.timeout_s)
     parameters = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, milliseconds, cv2.CAP_PROP_READ_TIMEOUT_MSEC, milliseconds]
     parameters += [cv2.CAP_PROP_N_THREADS, 1]  # a decoder with n threads delays the images by n frames
     return cv2.VideoCapture(config.path, cv2.CAP_FFMPEG, parameters)
 
 
-def _size_message(config: CameraConfig, size: tuple[int, ...], wanted: tuple[int, ...]) -> str:
-    return (
-        f"{config.name} sends frames of {size[0]} x {size[1]} pixels, but {wanted[0]} x {wanted[1]} were asked for: "
-        f"give CameraConfig a size that it sends (`v4l2-ctl -d {config.path} --list-formats-ext` lists those of a "
-        "device, and some need fourcc='MJPG')."
-    )
+def lock(device: Any, values: Mapping[str, float], *, current: bool = False) -> tuple[dict[str, float], list[str]]:
+    """Turn the automatic controls of settings off, set their values by field of `CameraConfig`, and read them back.
 
-
-def lock(device: Any, values: Mapping[str, float], *, current: bool = False) -> tuple[dict[str, float], dict[str, str]]:
-    """Turn the automatic controls of settings off, set their values, and read them back.
-
-    Args:
-        device: Open `cv2.VideoCapture`.
-        values: Values to set, by field name of `CameraConfig` (`exposure`, `white_balance`, `focus`).
-        current: If True, settings that `values` lacks are locked at their current values if the device has them.
-
-    Returns:
-        The values that the device has now, by field name, and texts on the properties that the driver did not set, by
-        OpenCV's name.
+    With `current`, settings that `values` lacks are locked at their current values. Returns the locked values that the
+    device has now, and texts on the properties that the driver did not set.
     """
     held: dict[str, float] = {}
-    refused: dict[str, str] = {}
+    refused: list[str] = []
 
-    def prop(name: str) -> int:
-        return int(getattr(cv2, f"CAP_PROP_{name}"))
-
-    def try_to_set(name: str, value: float, needed: bool) -> None:
-        device.set(prop(name), value)
-        actual = device.get(prop(name))
-        if actual == _UNSUPPORTED:
-            if needed:
-                refused[name] = f"{name}: asked for {value:g}, the driver lacks it"
-        elif abs(actual - value) > _TOLERANCE:
-            refused[name] = f"{name}: asked for {value:g}, found {actual:g}"
+    def put(name: str, value: float, needed: bool = True) -> float:
+        device.set(_property(name), value)
+        actual = device.get(_property(name))
+        if actual != _UNSUPPORTED and abs(actual - value) > _TOLERANCE:
+            refused.append(f"{name}: asked for {value:g}, found {actual:g}")
+        elif actual == _UNSUPPORTED and needed:
+            refused.append(f"{name}: asked for {value:g}, the driver lacks it")
+        return actual
 
     for field, name, automatic, off in _SETTINGS:
-        value = values.get(field)
-        if value is None and not current:
+        if field not in values and not current:
             continue
-        before = device.get(prop(name))
-        try_to_set(automatic, off, needed=value is not None or field != "focus")
-        if value is None and before == _UNSUPPORTED:
-            continue
-        try_to_set(name, before if value is None else value, needed=True)
-        actual = device.get(prop(name))
-        if actual != _UNSUPPORTED:
-            held[field] = actual
+        before = device.get(_property(name))
+        control = put(automatic, off, needed=field in values or field != "focus")  # many cameras have a fixed focus
+        if field in values or before != _UNSUPPORTED:
+            actual = put(name, values.get(field, before))
+            if actual != _UNSUPPORTED and control in (off, _UNSUPPORTED):
+                held[field] = actual
     return held, refused
 
 
-def _identical(a: Image, b: Image) -> bool:
-    """Return whether two images are equal. The first row is compared first, because it nearly always differs."""
-    return np.array_equal(a[0], b[0]) and np.array_equal(a, b)
+def _property(name: str) -> int:
+    return int(getattr(cv2, f"CAP_PROP_{name}"))

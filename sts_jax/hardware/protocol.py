@@ -1,4 +1,4 @@
-"""The serial protocol of the LED controller: messages as named tuples, and their encoding as lines of text.
+"""The serial protocol of the LED controller: messages, their encoding as lines of text, and an emulated controller.
 
 A line consists of ASCII text, `*`, the checksum of the text in four hexadecimal digits, and a newline, such as
 `7 PING*018E`. The host sends requests, and the controller answers each with one reply of the same sequence number.
@@ -6,10 +6,8 @@ docs/hardware/protocol.md defines them. Each message has exactly one valid line.
 """
 
 import binascii
-import contextlib
 import enum
 import re
-from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 VERSION = 1  # version of the protocol
@@ -109,27 +107,28 @@ class TurnedOff(NamedTuple):
 Request = Hello | Set | Ping | Watch
 Reply = Controller | State | Watch | Refused | TurnedOff
 
+_NUMBER = "(0|[1-9][0-9]*)"  # no sign and no leading zeros
+_NAME = "([A-Za-z0-9._-]+)"
+_TEXT = "(.*[^ ].*)"  # may contain spaces
 _UINT16, _UINT32 = range(2**16), range(2**32)
-_VERSION, _CHANNELS = range(VERSION, VERSION + 1), range(CHANNELS, CHANNELS + 1)
 _LEVELS = (range(256),) * CHANNELS
+_VERSION, _CHANNELS = range(VERSION, VERSION + 1), range(CHANNELS, CHANNELS + 1)
 _PERIOD = range(SHORTEST_WATCH_MS, LONGEST_WATCH_MS + 1)
 _NUMBERED = range(1, LAST_SEQUENCE + 1)
-_NAME = re.compile(r"[A-Za-z0-9._-]+")
-_TEXT = re.compile(r".*[^ ].*")  # may contain spaces, and is the last value of a line
 
-# Class, words after the sequence number, sequence number and values of each message. A range contains the valid numbers
-_REQUESTS: tuple[tuple[type, str, tuple], ...] = (
+# Class, words after the sequence number, and valid values of each message: a range of numbers, or a pattern
+_REQUESTS: tuple[tuple[type, str, tuple[range | str, ...]], ...] = (
     (Hello, "HELLO", (_NUMBERED, _UINT16)),
-    (Set, "SET", (_NUMBERED, _LEVELS)),
+    (Set, "SET", (_NUMBERED, *_LEVELS)),
     (Ping, "PING", (_NUMBERED,)),
     (Watch, "WATCH", (_NUMBERED, _PERIOD)),
 )
-_REPLIES: tuple[tuple[type, str, tuple], ...] = (
+_REPLIES: tuple[tuple[type, str, tuple[range | str, ...]], ...] = (
     (Controller, "OK HELLO", (_NUMBERED, _VERSION, _NAME, _NAME, _NAME, _CHANNELS)),
-    (State, "OK SET", (_NUMBERED, _LEVELS, _UINT32, _UINT16)),
-    (State, "OK PING", (_NUMBERED, _LEVELS, _UINT32, _UINT16, _UINT32)),
+    (State, "OK SET", (_NUMBERED, *_LEVELS, _UINT32, _UINT16)),
+    (State, "OK PING", (_NUMBERED, *_LEVELS, _UINT32, _UINT16, _UINT32)),
     (Watch, "OK WATCH", (_NUMBERED, _PERIOD)),
-    (Refused, "ERR", (range(LAST_SEQUENCE + 1), Code, _TEXT)),
+    (Refused, "ERR", (range(LAST_SEQUENCE + 1), range(1, len(Code) + 1), _TEXT)),
     (TurnedOff, "OFF watchdog", (range(1), range(1, 2**32))),
 )
 
@@ -141,12 +140,7 @@ def checksum(text: bytes) -> int:
 
 def encode(text: str) -> bytes:
     """Append the checksum and the newline to a text of printable ASCII without `*`."""
-    if not re.fullmatch(r"[ -)+-~]+", text):
-        raise ProtocolError(f"a message must consist of printable ASCII without '*', got {text!r}", Code.ARGUMENTS)
-    line = f"{text}*{checksum(text.encode()):04X}\n".encode()
-    if len(line) > LONGEST_LINE:
-        raise ProtocolError(f"a line must have at most {LONGEST_LINE} bytes, got {len(line)}: {text!r}", Code.LENGTH)
-    return line
+    return f"{text}*{checksum(text.encode()):04X}\n".encode()
 
 
 def decode(line: bytes) -> str:
@@ -176,27 +170,23 @@ def decode_request(line: bytes) -> Request:
     if request is not None:
         return request
     sequence, *words = text.split(" ")
-    try:
-        number = _value(_NUMBERED, [sequence])
-    except ValueError as error:
-        raise ProtocolError(f"the sequence number of {line!r} must be in 1..65535", Code.ARGUMENTS) from error
+    if not re.fullmatch(_NUMBER, sequence) or int(sequence) not in _NUMBERED:
+        raise ProtocolError(f"the sequence number of {line!r} must be in 1..65535", Code.ARGUMENTS)
     if words[:1] in [[name] for _, name, _ in _REQUESTS]:
-        raise ProtocolError(f"wrong number or range of arguments in {line!r}", Code.ARGUMENTS, number)
-    raise ProtocolError(f"unknown command in {line!r}", Code.COMMAND, number)
+        raise ProtocolError(f"wrong number or range of arguments in {line!r}", Code.ARGUMENTS, int(sequence))
+    raise ProtocolError(f"unknown command in {line!r}", Code.COMMAND, int(sequence))
 
 
 def encode_reply(reply: Reply) -> bytes:
     """Encode a reply as a line with its checksum and newline."""
-    line = encode(_written(reply, _REPLIES))
-    decode_reply(line)  # checks the ranges
-    return line
+    return encode(_written(reply, _REPLIES))
 
 
 def decode_reply(line: bytes) -> Reply:
     """Decode a reply from a line with its checksum and newline."""
     text = decode(line)
     reply = _read(text, _REPLIES)
-    if reply is None and (other := re.fullmatch(r"([1-9][0-9]*) OK HELLO (0|[1-9][0-9]*)( .*)?", text)):
+    if reply is None and (other := re.fullmatch(f"{_NUMBER} OK HELLO {_NUMBER}( .*)?", text)):
         # In all versions of the protocol, the first value of this reply is the version.
         sequence, version = int(other[1]), int(other[2])
         if sequence in _NUMBERED and version in _UINT16 and version != VERSION:
@@ -208,39 +198,91 @@ def decode_reply(line: bytes) -> Reply:
 
 def _written(message: Request | Reply, table: tuple) -> str:
     """The text of a message: that of the row with its class and its number of values."""
-    values = [value for value in message if value is not None]
-    name = next(name for kind, name, ranges in table if isinstance(message, kind) and len(ranges) == len(values))
-    return " ".join([str(values[0]), name, *_words(values[1:])])
-
-
-def _words(values: Iterable[Any]) -> list[str]:
-    return [word for value in values for word in (_words(value) if isinstance(value, tuple) else [f"{value}"])]
+    values: list[Any] = [value for value in message if value is not None]
+    if isinstance(message, Set | State):
+        values[1:2] = message.levels
+    name = next(name for kind, name, valid in table if isinstance(message, kind) and len(valid) == len(values))
+    return " ".join([str(values[0]), name, *(f"{value}" for value in values[1:])])
 
 
 def _read(text: str, table: tuple) -> Any:
     """The message that has a text, or None."""
-    for kind, name, ranges in table:
-        sequence, *words = text.split(" ")
-        names, words = words[: name.count(" ") + 1], [sequence, *words[name.count(" ") + 1 :]]
-        with contextlib.suppress(ValueError, IndexError):
-            values = [_value(valid, words) for valid in ranges]
-            if names == name.split(" ") and not words:
-                return kind(*values)
+    for kind, name, valid in table:
+        first, *rest = (_NUMBER if isinstance(each, range) else each for each in valid)
+        match = re.fullmatch(" ".join([first, name, *rest]), text)
+        if match is None:
+            continue
+        pairs = zip(valid, match.groups(), strict=True)
+        values: list[Any] = [int(word) if isinstance(each, range) else word for each, word in pairs]
+        if any(isinstance(each, range) and value not in each for each, value in zip(valid, values, strict=True)):
+            continue
+        if kind in (Set, State):
+            values[1 : 1 + CHANNELS] = [tuple(values[1 : 1 + CHANNELS])]
+        if kind is Refused:
+            values[1] = Code(values[1])
+        return kind(*values)
     return None
 
 
-def _value(valid: Any, words: list[str]) -> Any:
-    """Take the words of one value, and return the value. Any word that is not valid raises a `ValueError`."""
-    if isinstance(valid, tuple):
-        return tuple(_value(each, words) for each in valid)
-    if valid is _TEXT:
-        words[:] = [" ".join(words)]
-    word = words.pop(0)
-    if isinstance(valid, re.Pattern):
-        if not valid.fullmatch(word):
-            raise ValueError(word)
-        return word
-    # a number without sign and leading zeros
-    if not re.fullmatch(r"0|[1-9][0-9]{0,9}", word) or (isinstance(valid, range) and int(word) not in valid):
-        raise ValueError(word)
-    return int(word) if isinstance(valid, range) else valid(int(word))
+class EmulatedController:
+    """An emulated LED controller without a clock: each call passes the time. Tests compare it with the firmware."""
+
+    def __init__(self, *, now_s: float = 0.0, boot: int = 1, serial_number: str = "EMULATED"):
+        """Boot the controller for the `boot`-th time with all lights off, at the time `now_s` of the caller's clock."""
+        self.levels = DARK  # levels that are applied now
+        self.counter = 0  # number of changes of the levels since the boot
+        self.boot = boot
+        self.watch_ms = DEFAULT_WATCH_MS  # period of the watchdog (ms)
+        self._serial_number = serial_number
+        self._boot_s = self._valid_s = now_s  # times of the boot and of the last valid request (s)
+        self._pending = b""  # bytes of an incomplete line
+        self._answered: tuple[bytes, bytes] | None = None  # the last request that was executed, and its answer
+
+    def receive(self, data: bytes, now_s: float) -> bytes:
+        """Process any number of bytes from the host, and return the lines that the controller sends."""
+        sent = self.tick(now_s)
+        *lines, self._pending = (self._pending + data).split(b"\n")
+        self._pending = self._pending[:LONGEST_LINE]  # enough to see that the line is too long
+        return sent + b"".join(self._answer(line + b"\n", now_s) for line in lines if line)
+
+    def tick(self, now_s: float) -> bytes:
+        """Turn the lights off if the watchdog's period has passed, and return the line that reports it."""
+        if self.levels == DARK or now_s - self._valid_s < self.watch_ms / 1000:
+            return b""
+        self._apply(DARK)
+        return encode_reply(TurnedOff(0, self.counter))
+
+    def _answer(self, line: bytes, now_s: float) -> bytes:
+        """The reply to one line. A repeated line gets the same reply again and is not executed."""
+        if self._answered is not None and line == self._answered[0]:
+            self._valid_s = now_s
+            return self._answered[1]
+        try:
+            reply = encode_reply(self._execute(decode_request(line), now_s))
+        except ProtocolError as error:
+            text = f"protocol {VERSION}" if error.code is Code.VERSION else error.code.name.lower()
+            return encode_reply(Refused(error.sequence, error.code, text))
+        self._valid_s = now_s
+        self._answered = line, reply
+        return reply
+
+    def _execute(self, request: Request, now_s: float) -> Reply:
+        match request:
+            case Hello(sequence, version):
+                if version != VERSION:
+                    raise ProtocolError(f"unknown version {version}", Code.VERSION, sequence)
+                return Controller(sequence, VERSION, "emulated", "emulation", self._serial_number, CHANNELS)
+            case Set(sequence, levels):
+                self._apply(levels)
+                return State(sequence, self.levels, self.counter, self.boot)
+            case Ping(sequence):
+                uptime_ms = int(1000 * (now_s - self._boot_s)) % 2**32
+                return State(sequence, self.levels, self.counter, self.boot, uptime_ms)
+            case Watch(sequence, period_ms):
+                self.watch_ms = period_ms
+                return request
+
+    def _apply(self, levels: Levels) -> None:
+        if levels != self.levels:
+            self.levels = levels
+            self.counter += 1

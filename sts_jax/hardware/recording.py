@@ -25,9 +25,9 @@ import av
 import numpy as np
 
 from sts_jax import storage
-from sts_jax.hardware.proof import Pair, Shot, Stream
 from sts_jax.hardware.sensor_file import Device, copy_sensor, sensor_file
 from sts_jax.hardware.session import Origin, shot_facts, shot_of
+from sts_jax.hardware.sts import Pair, Shot, Stream
 from sts_jax.storage import DamagedFileError
 
 FRAMES = "frames.jsonl"

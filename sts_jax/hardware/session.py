@@ -28,8 +28,7 @@ from jaxtyping import Int, UInt8
 from sts_jax import storage
 from sts_jax.hardware import protocol
 from sts_jax.hardware.leds import Lit
-from sts_jax.hardware.proof import Pair, Shot, Stream
-from sts_jax.hardware.sts import STS
+from sts_jax.hardware.sts import STS, Pair, Shot, Stream
 from sts_jax.storage import MANIFEST, DamagedFileError
 
 _TRAJECTORIES, _DISCARDED = "trajectories", "discarded"

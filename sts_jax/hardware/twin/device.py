@@ -18,21 +18,16 @@ from jaxtyping import UInt8
 from sts_jax import storage
 from sts_jax.hardware import protocol
 from sts_jax.hardware.camera import Captured
-from sts_jax.hardware.emulation import EmulatedController
-from sts_jax.hardware.leds import Lit
+from sts_jax.hardware.leds import Leds, Lit
 from sts_jax.hardware.lens import Lens
-from sts_jax.hardware.proof import Pair, ProvenFrames, Settling
 from sts_jax.hardware.session import Origin
-from sts_jax.hardware.sts import checked_levels
+from sts_jax.hardware.sts import STS, Settling
 from sts_jax.hardware.twin import photometry
 from sts_jax.hardware.twin.scene import Scene, Seen
 
 CAMERA = "twin"  # name of the camera in sessions and sensor files
 _ANSWER_S = 0.004  # duration of a request on the virtual clock (s). Its levels apply after half of this time
 _TICK_S = 0.005  # period with which the watchdog is checked on the virtual clock (s)
-_SWITCHES = 8  # number of switches in each direction from which the settling times are measured
-_WATCH_S = 1.0  # time after the first switch in each direction during which frames are watched (s)
-_TIMEOUT_S = 10.0  # longest wait for a pair (s)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -219,7 +214,7 @@ class Twin:
 
     def _boot(self, now_s: float) -> None:
         self._epoch_s = now_s  # begin of the camera's first exposure
-        self._controller = EmulatedController(now_s=now_s, serial_number=self.serial_number)
+        self._controller = protocol.EmulatedController(now_s=now_s, serial_number=self.serial_number)
         self._lights = photometry.LightHistory(self.imperfections.rise_s)
 
     def _request(self, request: protocol.Set | protocol.Ping) -> Lit:
@@ -232,14 +227,16 @@ class Twin:
         return Lit(reply.levels, reply.counter, reply.boot, sent_s, self.now_s)
 
 
-class _Devices:
-    """Camera, LED controller and clock of a twin as `ProvenFrames` uses them."""
+class _Devices(Leds):
+    """Camera, LED controller and clock of a twin, as `STS` uses them."""
 
-    source = CAMERA
+    source, port, is_connected = CAMERA, CAMERA, True
 
     def __init__(self, twin: Twin):
         self._twin = twin
-        self.set, self.ping, self.sleep = twin.set, twin.ping, twin.step
+
+    def connect(self, warmup_s: float = 1.0) -> None:  # type: ignore[override]
+        raise AssertionError("a twin is connected already")
 
     def async_read(self, timeout_ms: float | None = None) -> Captured:
         del timeout_ms  # a virtual frame always arrives
@@ -249,34 +246,34 @@ class _Devices:
         self.ping()  # keeps the lights on, as the thread of `hardware.Leds` does
         return Captured(image, time_s, exposure.index)
 
+    def set(self, levels: Sequence[int]) -> Lit:
+        return self._twin.set(levels)
+
+    def ping(self) -> Lit:
+        return self._twin.ping()
+
     def monotonic(self) -> float:
         return self._twin.now_s
 
-    def reconnect(self, *, limit_s: float) -> None:
-        raise AssertionError("a virtual controller is never lost")
+    def sleep(self, seconds: float) -> None:
+        self._twin.step(seconds)
+
+    def close(self) -> None:
+        """The twin stays open."""
+
+    disconnect = close
 
 
-class VirtualSensor:
-    """Reads pairs from a `Twin` on its virtual clock. `hardware.collect` accepts it in place of `hardware.STS`.
-
-    The proof of light is that of `STS`. Attributes: `settling`, and `origin` for `hardware.Session`.
-    """
+class VirtualSensor(STS):
+    """An `STS` of a `Twin` on its virtual clock. `origin` identifies it for `hardware.Session`."""
 
     def __init__(self, twin: Twin, *, levels: Sequence[int] = (255, 255, 255, 255), settling: Settling | None = None):
         """Connect to a twin. Without `settling`, the settling times are measured. The scene must then be at rest."""
-        self._twin, devices = twin, _Devices(twin)
-        limits = {"timeout_s": _TIMEOUT_S, "reconnect_s": _TIMEOUT_S}
-        levels = checked_levels(levels)
-        self._frames = ProvenFrames(devices, devices, levels=levels, exposures=None, clock=devices, **limits)
+        devices = _Devices(twin)
+        super().__init__(camera=devices, leds=devices, levels=levels, settling=settling, clock=devices)
         height, width, _ = twin.capture()[1].shape
-        self.origin = Origin(CAMERA, twin.serial_number, width, height, levels)
-        if settling is not None:
-            self._frames.see_both(settling)
-        self.settling = self._frames.measure_settling(_SWITCHES, _WATCH_S) if settling is None else settling
-
-    def read(self) -> Pair:
-        """Take a visual and a tactile image, whose frames arrive after the start of this call."""
-        return self._frames.pair(self._twin.now_s + _TIMEOUT_S)
+        self.origin = Origin(CAMERA, twin.serial_number, width, height, self.levels)
+        self.connect()
 
 
 def read_log(path: str | os.PathLike) -> list[Exposure]:
