@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 import sts_jax as sts
 from benchmarks import depth
-from experiments.sense import Config, lay
+from experiments.shared.laying import Placed, lay
 from sts_jax import geometry, objects, sense, tactile
 
 SENSOR = sts.Sensor()
@@ -32,7 +32,7 @@ def rest(name):
         x, y = 0.0113, -0.0071
         return ball(RADIUS), np.array([x, y, RADIUS, 1, 0, 0, 0]), np.array([0, 0, FORCE, FORCE * y, -FORCE * x, 0])
     body = objects.make(jax.random.key(3), name)
-    return body, *lay(Config(name, position=(0.0113, -0.0071), turn=17.0), sts.Sensor(), body)[:2]
+    return body, *lay(Placed(name, position=(0.0113, -0.0071), turn=17.0), sts.Sensor(), body)[:2]
 
 
 def seen(name, sensor, size, crop=False):
