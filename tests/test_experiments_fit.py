@@ -74,11 +74,9 @@ def test_the_wrench_moves_with_the_pose():
         ({"starts": 0}, "starts is 0, but it must be at least 1"),
         ({"force": 0.0}, "force is 0, but it must be > 0"),
         ({"position": (0.3, 0.0), "resolution": SMALL}, "scissors leaves no imprint in view"),
-        ({"mesh": "teapot"}, "teapot is neither a file nor an object class"),
-        ({"resolution": (0, 64)}, "must be > 0"),
     ],
 )
 def test_an_object_that_cannot_be_fitted_is_refused(tmp_path, changes, message):
-    with pytest.raises((ValueError, FileNotFoundError), match=message):
+    with pytest.raises(ValueError, match=message):
         fit.main(fit.Config(**{"mesh": "scissors", "out": tmp_path / "a.png"} | changes))
     assert not list(tmp_path.iterdir())

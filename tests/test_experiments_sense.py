@@ -92,17 +92,11 @@ def test_a_sheet_shows_all_classes(tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().out.count("deepest imprint") == 2
 
 
-def test_a_sensor_of_a_file_is_used(box, tmp_path):
-    path = tmp_path / "soft.json"
-    sensor = sts.Sensor()
+def test_a_sensor_of_a_file_is_used(box, tmp_path, capsys):
+    sensor, path = sts.Sensor(), tmp_path / "soft.json"
     dataclasses.replace(sensor, gel=dataclasses.replace(sensor.gel, stiffness=1e6)).save(path)
     sense.main(sense.Config(str(box), out=tmp_path / "a.png", resolution=TINY, mass=0.1, sensor=path))
-    soft = sense.look(
-        sense.Config(str(box), resolution=TINY, mass=0.1),
-        sts.Sensor.load(path),
-        laying.read(sense.Config(str(box), mass=0.1), str(box)),
-    )[2]
-    assert "deepest imprint 0.82 mm" in soft
+    assert "deepest imprint 0.82 mm" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
