@@ -14,7 +14,7 @@ from PIL import Image
 from serial.tools import list_ports_common
 
 import sts_jax as sts
-from benchmarks.instruments.peers import DARK, LIT, Lights, Peer, SeenController, SeenLights
+from benchmarks.instruments.peers import DARK, LIT, Peer, SeenLights, SensorPeer
 from experiments import commission
 from experiments.shared import commissioning
 from sts_jax import hardware
@@ -46,26 +46,18 @@ class SeenBoards(SeenLights):
     def _frame(self):
         end_s = time.monotonic() - self.lag_s
         _, mean = self.lights.shares(end_s - self.exposure_s, end_s)
-        if self.board is None:
-            image = np.full((HEIGHT, WIDTH, 3), DARK + mean * (LIT - DARK), np.uint8)
-        else:
-            image = self.pictures[self.board]
-        noisy = cv2.add(image, self.noises[self.number % 3])
-        return cv2.imencode(".jpg", noisy, [cv2.IMWRITE_JPEG_QUALITY, 97])[1].tobytes()
+        plain = np.full((HEIGHT, WIDTH, 3), DARK + mean * (LIT - DARK), np.uint8)
+        image = cv2.add(plain if self.board is None else self.pictures[self.board], self.noises[self.number % 3])
+        return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 97])[1].tobytes()
 
 
-class BoardPeer:
-    """Both devices. A host connects to the camera at `url` and to the controller at `path`."""
+class BoardPeer(SensorPeer):
+    """A sensor whose camera can see the board."""
 
     def __init__(self, path, pictures):
-        lights = Lights()
-        self.leds = Peer(path, clock=time.monotonic, make=functools.partial(SeenController, lights))
-        self.camera = SeenBoards(lights, pictures)
-        self.path, self.url = str(path), self.camera.url
-
-    def stop(self):
+        super().__init__(path)
         self.camera.stop()
-        self.leds.vanish()
+        self.camera = SeenBoards(self.lights, pictures)
 
 
 @pytest.fixture(scope="module")
