@@ -123,7 +123,8 @@ def test_mistakes_in_a_scenario_are_named(page, changes, match):
 @pytest.mark.slow
 def test_the_stages_of_an_experiment_train_and_evaluate_a_new_scenario(page, tmp_path):
     scenario = page["Rolled"](frames=16)
-    run.main(tiny(perturbed.SMOKE, scenario), tmp_path)
+    fewer = dataclasses.replace(perturbed.SMOKE.collection, num_objects=10)
+    run.main(tiny(dataclasses.replace(perturbed.SMOKE, collection=fewer), scenario), tmp_path)
     summary = json.loads((tmp_path / "metrics.json").read_text())
     assert set(summary["outcomes"]) <= {outcome.name.lower() for outcome in scenario.outcomes}
     assert sum(summary["outcomes"].values()) == summary["items"]
