@@ -258,8 +258,9 @@ def test_belief_from_several_inputs_is_the_product_of_their_beliefs(sample, batc
 
 @pytest.mark.slow
 def test_items_that_do_not_count_may_be_nan(sample, loss, batch):
-    present = {name: x.at[i].set(False) for i, (name, x) in enumerate(batch["present"].items())}
-    broken = {name: x.at[i].set(jnp.nan) for i, (name, x) in enumerate(batch["inputs"].items())}
+    names = list(enumerate(statespace.INPUTS))
+    present = {name: batch["present"][name].at[i].set(False) for i, name in names}
+    broken = {name: batch["inputs"][name].at[i].set(jnp.nan) for i, name in names}
     masked = batch | {"present": present}
     same(sample(masked | {"inputs": broken}), sample(masked))
     same(loss(masked | {"inputs": broken}), loss(masked))
