@@ -55,7 +55,7 @@ def plain_conv_transpose(x: Array, kernel: Array, stride: int, padding: int) -> 
 
 
 def stepper(
-    model: mvae.Config | statespace.Config, batch: training.Arrays, size: int, absent: tuple[str, ...] = ()
+    model: mvae.Config | statespace.Config, batch: dict[str, Any], size: int, absent: tuple[str, ...] = ()
 ) -> Callable[[], None]:
     """Make a function that runs one compiled training step of a model."""
     config = training.TrainConfig(batch_size=size)
