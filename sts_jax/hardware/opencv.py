@@ -47,8 +47,6 @@ _SETTINGS: tuple[tuple[str, str, str, float], ...] = (
 _UNSUPPORTED = -1.0  # returned by OpenCV for a property that the driver lacks
 _TOLERANCE = 0.5  # largest difference that counts as accepted, because drivers store whole numbers
 
-Image = UInt8[np.ndarray, "height width 3"]
-
 
 @dataclasses.dataclass
 class CameraStatistics:
@@ -422,7 +420,7 @@ class Capture:
         except cv2.error:
             return False
 
-    def retrieve(self) -> Image | None:
+    def retrieve(self) -> UInt8[np.ndarray, "height width 3"] | None:
         """Decode the frame of the last `grab` to an RGB image. The result is None if the frame is damaged."""
         try:
             complete, image = self.device.retrieve()
