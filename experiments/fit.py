@@ -155,7 +155,7 @@ def draw(config: Config, target: np.ndarray, paths: list[list[tuple[np.ndarray, 
 
     figure = Figure(figsize=(13, 8), layout="constrained")
     axes = figure.subplots(2, 3).ravel()
-    panels = [("target", target)]
+    panels: list[tuple[str, np.ndarray | jax.Array]] = [("target", target)]
     for name, (at, there) in (("start", first), ("end", last)):
         panels.append(("{}, {:.3f} mm, {:+.2f} degrees off".format(name, *errors(at)), there.image))
         panels.append((f"{name} less target", 0.5 + (there.image - target) / 2))

@@ -50,7 +50,8 @@ class Config:
 
 def streams(visual: np.ndarray, tactile: np.ndarray, numbers: np.ndarray) -> gap.Streams:
     """The initial and the final image of numbered trajectories, from images (n, 2, height, width, 3)."""
-    return gap.Streams(*(leaf.reshape(-1, *leaf.shape[2:]) for leaf in (visual, tactile)), np.repeat(numbers, 2))
+    visual, tactile = (leaf.reshape(-1, *leaf.shape[2:]) for leaf in (visual, tactile))
+    return gap.Streams(visual, tactile, np.repeat(numbers, 2))
 
 
 def session(folder: Path, sensor: Path | None, resolution: tuple[int, int]) -> gap.Streams:

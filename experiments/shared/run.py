@@ -119,8 +119,13 @@ def with_meshes(collection: dataset.Collection, folder: Path, args: Args) -> dat
         max(number, round(collection.num_objects * number / count))
         for number in (collection.num_per_object, collection.rendered_per_object)
     )
-    rendered = None if collection.num_rendered is None else rendered
-    return dataclasses.replace(collection, meshes=meshes, num_objects=count, num_per_object=each, num_rendered=rendered)
+    return dataclasses.replace(
+        collection,
+        meshes=meshes,
+        num_objects=count,
+        num_per_object=each,
+        num_rendered=None if collection.num_rendered is None else rendered,
+    )
 
 
 def main(config: Config, workdir: Path, *, only: Stage | None = None, own: Extensions = NONE) -> None:
@@ -201,8 +206,8 @@ def jobs(
         schedule = config.training
         if config.steps is not None:
             schedule = dataclasses.replace(schedule, steps=config.steps[number])
-        model = training.paper_model(modalities, preprocessing, measurements=further)
-        yield Job(name, schedule, model, arrays, preprocessing, empty)
+        networks = training.paper_model(modalities, preprocessing, measurements=further)
+        yield Job(name, schedule, networks, arrays, preprocessing, empty)
 
 
 def train(run: Run, data: dataset.Dataset, own: Extensions = NONE) -> None:

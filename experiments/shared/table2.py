@@ -215,9 +215,8 @@ def predictions(models: Mapping[str, Path], data: Recorded) -> dict[str, Predict
         for given, subset in evaluation.subsets(predictor.modalities).items():
             out = predictor(**{stream: first[stream] for stream in subset})  # type: ignore[arg-type]
             title = TITLES[name] if len(subset) == len(predictor.modalities) else f"{TITLES[name]}, {given} alone"
-            rows[title] = Predicted(
-                *(None if image is None else np.asarray(image) for image in (out.visual, out.tactile))
-            )
+            visual, tactile = (None if image is None else np.asarray(image) for image in (out.visual, out.tactile))
+            rows[title] = Predicted(visual, tactile)
     return rows
 
 
@@ -234,12 +233,12 @@ def transferred(config: Config, data: Recorded, workdir: Path) -> Predicted | No
     recorded, model = SensorView(**_unit(large.empty)), SensorView(**predictor.empty)
     views = _relit(SensorView(**_held(large)), recorded, model)
     out = predictor(visual=views.visual, tactile=views.tactile)
-    if np.shape(out.visual)[1:3] != (side, side):
+    predicted, step = SensorView(np.asarray(out.visual), np.asarray(out.tactile)), height // side
+    if predicted.visual.shape[1:3] != (side, side):
         return None
-    step = height // side
     small = SensorView(*(image.reshape(side, step, side, step, 3).mean((1, 3)) for image in model))
-    predicted = SensorView(np.asarray(out.visual), np.asarray(out.tactile))
-    return Predicted(*_relit(predicted, small, SensorView(**_unit(data.empty))))
+    back = _relit(predicted, small, SensorView(**_unit(data.empty)))
+    return Predicted(back.visual, back.tactile)
 
 
 def _relit(images: SensorView, given: SensorView, wanted: SensorView) -> SensorView:
