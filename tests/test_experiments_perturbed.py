@@ -55,7 +55,7 @@ def complaints(workdir, top, inputs):
     """What the readers of a part of a work directory say, with the settings and the checksums of the undamaged run."""
     try:
         if top == "config.json":
-            run.claim(TINY, workdir)
+            storage.claim(workdir / "config.json", dataclasses.asdict(TINY))
         elif top == "dataset":
             data = dataset.load(workdir / "dataset")
             data.pairs(data.rendered())
