@@ -149,7 +149,7 @@ def test_bad_replies_are_rejected(text):
         (lambda: protocol.encode_request(protocol.Set(1, (0, 0, 0, 300))), "wrong number or range of arguments"),
         (lambda: checked_levels((1, 2, 3)), "levels must be 4 integers"),
         (lambda: checked_levels((0, 0, 0, 256)), "levels must be 4 integers"),
-        (lambda: checked_levels((0, 0, 0, 0.5)), "levels must be 4 integers"),
+        (lambda: checked_levels((0, 0, 0, -1)), "levels must be 4 integers"),
     ],
 )
 def test_bad_values_are_named(call, message):
