@@ -117,8 +117,7 @@ def main(args: Args) -> str:
         gain = evaluation.gain(scores["from visual"], scores["from visual and tactile"], test)
         assert gain is not None
         notes.append(
-            f"Touch removes {gain['value']:.3f} [{gain['low']:.3f}, {gain['high']:.3f}] of the outcome's log loss from "
-            "vision."
+            f"Touch removes {evaluation.metrics.written(**gain, digits=3)} of the outcome's log loss from vision."
         )
     summary = evaluation.summarise(scores, test, outcomes=scenario.outcomes)
     measured = "the shipped model" if args.trained is None else f"the model in {args.trained}"

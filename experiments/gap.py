@@ -8,7 +8,7 @@
 default, a real and a simulated trajectory with the same number must show the same object in the same poses. Give
 `--match none` if the two folders show the same object in different poses. The measures are described in
 `docs/hardware/gap.md`. The text and a figure of the images go to the folder `--out`. The classifier needs scikit-learn
-(`pip install -e '.[bench]'`).
+and threadpoolctl (`pip install scikit-learn threadpoolctl`).
 """
 
 import dataclasses
@@ -21,7 +21,7 @@ import tyro
 
 import sts_jax as sts
 from experiments.shared import drawing, terminal
-from sts_jax import dataset, hardware, storage
+from sts_jax import dataset, evaluation, hardware, storage
 from sts_jax.evaluation import figures, gap
 
 STREAMS = ("visual", "tactile")
@@ -137,7 +137,7 @@ def measured(real: gap.Streams, simulated: gap.Streams, stream: str, *, matched:
     """Compare the real with the simulated images of one stream: formatted values by the names of the metrics."""
 
     def written(estimate: gap.Estimate, digits: int) -> str:
-        return f"{estimate.value:.{digits}f} [{estimate.low:.{digits}f}, {estimate.high:.{digits}f}]"
+        return evaluation.metrics.written(*estimate, digits)
 
     first, second = getattr(real, stream), getattr(simulated, stream)
     rows = {}

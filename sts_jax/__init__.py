@@ -21,3 +21,5 @@ from sts_jax.frame import touch as touch
 from sts_jax.predict import Prediction as Prediction
 from sts_jax.predict import Predictor as Predictor
 from sts_jax.sensor import Sensor as Sensor
+
+__version__ = "0.1.0"

@@ -28,6 +28,24 @@ def test_classes_of_different_sizes_have_equal_proportions_in_all_parts(seed):
     assert 110 in split["train"]  # the only object of its class
 
 
+@pytest.mark.parametrize("shares", [(0.9, 0.04, 0.06), (0.7, 0.1, 0.2), (0.04, 0.06, 0.9)])
+@pytest.mark.parametrize("count", [9, 10, 24])
+def test_each_part_of_a_folder_of_meshes_has_at_least_three_objects(count, shares):
+    names = tuple(f"{i}.stl" for i in range(count))
+    meshes = dataset.Meshes("meshes", names, tuple("ab"[i % 2] for i in range(count)), "")
+    split = dataset.split_objects(dataset.Collection(meshes=meshes, num_objects=count, shares=shares))
+    assert sorted(i for part in split.values() for i in part) == list(range(count))
+    assert min(map(len, split.values())) == 3
+
+
+def test_a_part_without_a_share_stays_empty_and_one_procedural_object_is_not_enough():
+    meshes = dataset.Meshes("meshes", tuple(f"{i}.stl" for i in range(20)), ("a",) * 20, "")
+    split = dataset.split_objects(dataset.Collection(meshes=meshes, num_objects=20, shares=(0.95, 0.05, 0.0)))
+    assert [len(part) for part in split.values()] == [17, 3, 0]
+    split = dataset.split_objects(dataset.Collection(num_objects=24, shares=(0.9, 0.04, 0.06)))
+    assert [len(part) for part in split.values()] == [18, 3, 3]
+
+
 def test_classes_follow_the_categories():
     collection = dataset.Collection(categories=("fork", "bottle"), num_objects=20)
     names = dataset.class_names(collection)

@@ -4,6 +4,7 @@ import dataclasses
 import enum
 import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -287,6 +288,36 @@ def test_the_gain_is_the_removed_share_of_the_log_loss(scored):
     gain = evaluation.gain(scores["model"], half, test, num=50)
     np.testing.assert_allclose([gain[key] for key in ("value", "low", "high")], 0.5)
     assert evaluation.gain(scores["model"], scores["copy of the input"], test) is None
+
+
+def test_there_is_no_interval_from_items_of_one_object(scored):
+    test, scores = scored
+    alone = test._replace(object=np.zeros_like(test.object))
+    summary = evaluation.summarise(scores, alone, metrics=OWN, num=5)
+    cells = [cell for row in summary["predictors"].values() for cell in row.values() if cell]
+    cells += [cell for row in summary["differences"]["model"].values() for cell in row.values() if cell]
+    assert {(cell["low"], cell["high"]) for cell in cells} == {(None, None)}
+    text, full = evaluation.table(summary, title="t"), evaluation.full_table(summary, title="t", metrics=OWN)
+    assert not re.search(r"\[[^-]*\d", text + full)
+    assert all("[-] stands for no interval, because all items are of one object." in page for page in (text, full))
+    gain = evaluation.gain(scores["model"], {name: errors / 2 for name, errors in scores["model"].items()}, alone)
+    assert gain == {"value": pytest.approx(0.5), "low": None, "high": None}
+    assert metrics.written(**gain, digits=2) == "0.50 [-]"
+
+
+def test_a_metric_of_some_items_needs_two_objects_among_these(scored):
+    test, scores = scored
+    one_stays = np.where(test.object == 0, test.outcome, FELL).astype(np.int32)
+    cells = evaluation.summarise(scores, test._replace(outcome=one_stays), metrics=OWN, num=20)["predictors"]["model"]
+    assert cells["position_on_pad"]["low"] is cells["position_on_pad"]["high"] is None
+    assert cells["position"]["low"] < cells["position"]["high"]
+
+
+def test_there_is_no_interval_from_one_trajectory_of_a_sensor():
+    one = TEST.take(slice(1))
+    summary = evaluation.image_summary({name: evaluation.first(row, 1) for name, row in IMAGES.items()}, one, num=5)
+    assert summary["visual"]["predictors"][COPY]["bce"]["low"] is None
+    json.dumps(summary, allow_nan=False)
 
 
 def test_outcomes_are_named_by_the_scenario(scored):

@@ -259,8 +259,8 @@ def test_decimation_of_loose_parts(tmp_path):
 
 
 def test_the_error_names_the_missing_package(tmp_path, monkeypatch):
-    trimesh.creation.icosphere(subdivisions=5, radius=0.04).export(tmp_path / "ball.ply")
-    monkeypatch.setitem(sys.modules, "fast_simplification", None)
-    listed = objects.library(tmp_path)
-    with pytest.raises(ImportError, match=r"ball\.ply.*fast-simplification.*install -e '\.\[meshes\]'"):
+    trimesh.creation.annulus(0.03, 0.04, 0.02).export(tmp_path / "ring.ply")
+    monkeypatch.setitem(sys.modules, "coacd", None)
+    listed = objects.library(tmp_path, parts=True)
+    with pytest.raises(ImportError, match="coacd, which is not installed: pip install coacd"):
         objects.bodies(listed)

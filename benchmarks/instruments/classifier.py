@@ -27,7 +27,7 @@ class Interval(NamedTuple):
     high: float
 
     def __str__(self) -> str:
-        return f"{self.value:.3f} [{self.low:.3f}, {self.high:.3f}]"
+        return metrics.written(*self, digits=3)
 
 
 def probabilities(x: np.ndarray, y: np.ndarray, groups: np.ndarray) -> np.ndarray:

@@ -271,7 +271,9 @@ def _check_parts(collection: dataset.Collection, split: str) -> None:
         sizes = {"train": train, "test": count - train}
     name = min(sizes, key=sizes.__getitem__)
     if sizes[name] < 1:
-        more = "raise --collection.num-objects" if collection.meshes is None else "add usable objects to the folder"
+        more = "raise --collection.num-objects"
+        if collection.meshes is not None:
+            more = f"add usable objects to the folder ({3 * dataset.LEAST} are enough), give --splits trajectory"
         raise ValueError(
             f"the part {name!r} of the split by {split} is empty: there are {sum(sizes.values())} {items}, and "
             f"collection.shares is {collection.shares}: {more}, or give other --collection.shares, such as 0.7 0.1 0.2"

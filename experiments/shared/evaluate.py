@@ -178,7 +178,7 @@ def _notes(
     ]
     rows = [f"{TITLES[run.main_model]}, from {given}" for given in ("visual", "visual and tactile")]
     if all(row in scores for row in rows) and (gain := evaluation.gain(scores[rows[0]], scores[rows[1]], test)):
-        interval = f"{gain['value']:.3f} [{gain['low']:.3f}, {gain['high']:.3f}]"
+        interval = evaluation.metrics.written(**gain, digits=3)
         notes.append(f"Touch removes {interval} of the outcome's log loss from vision.")
     return notes
 

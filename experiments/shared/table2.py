@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import tyro
@@ -285,9 +285,8 @@ def draw(config: Config, data: Recorded, predicted: Mapping[str, Predicted], pat
 def as_table(config: Config, data: Recorded, summary: dict, logs: Mapping[str, list[dict]]) -> str:
     """Write the scores with their 95 % intervals (`evaluation.image_summary`) as a table in Markdown."""
 
-    def cell(x: Mapping[str, float], factor: float = 1, digits: int = 3) -> str:
-        value, low, high = (f"{factor * x[key]:.{digits}f}" for key in ("value", "low", "high"))
-        return f"{value} [{low}, {high}]"
+    def cell(x: Mapping[str, Any] | None, factor: float = 1, digits: int = 3) -> str:
+        return "NA" if x is None else evaluation.metrics.written(**x, digits=digits, factor=factor)
 
     titles = ("BCE (x1e-4)", "skill", "skill against the copy")
     heads = ["predictor", *(f"{stream} {title}" for stream in summary for title in titles)]
@@ -298,6 +297,7 @@ def as_table(config: Config, data: Recorded, summary: dict, logs: Mapping[str, l
             x = scores["predictors"].get(name)
             rows[-1] += ["NA"] * 3 if x is None else [cell(x["bce"], 1e4, 0), cell(x["skill"]), cell(x["skill_copy"])]
     lines = [f"| {' | '.join(row)} |" for row in rows]
+    alone = " [-] stands for no interval, because only one trajectory is held out." * any("[-]" in x for x in lines)
     num = len(data.train.number), len(data.validation.number)
     steps = ", ".join(f"{name} {log[-1]['step'] if log else 0}" for name, log in logs.items())
     return "\n".join(
@@ -308,7 +308,7 @@ def as_table(config: Config, data: Recorded, summary: dict, logs: Mapping[str, l
             f"{config.image_size}x{config.image_size}. In brackets: 95 % intervals, bootstrapped over validation "
             "trajectories. BCE is the binary cross-entropy per pixel and channel. Its smallest value is the entropy "
             "of the true images. Skill is 1 - excess / excess of the constant, and the last column of a stream "
-            "replaces the constant by the copy of the input, where excess is the BCE above its smallest value.",
+            f"replaces the constant by the copy of the input, where excess is the BCE above its smallest value.{alone}",
             "",
             lines[0],
             "|---" * len(heads) + "|",

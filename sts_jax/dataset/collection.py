@@ -15,6 +15,7 @@ from sts_jax.dataset.meshes import Meshes, open_library
 
 _NUMBER = NOT_NEGATIVE | {"whole": True}  # 0 or a larger whole number
 PARTS = ("train", "validation", "test")  # the parts into which the objects are split
+LEAST = 3  # number of objects in the smallest part of a split of nine or more objects
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,6 +113,9 @@ def make_bodies(collection: Collection, indices: np.ndarray) -> list[objects.Bod
 def split_objects(collection: Collection) -> dict[str, np.ndarray]:
     """Split the objects of a collection at random into parts with nearly equal proportions of the classes.
 
+    Of nine or more objects, each part has at least three, because the spread of one or two says little. Two exceptions
+    keep datasets that exist already: procedural objects may have parts of two, and none where the share rounds to 0.
+
     Returns:
         Sorted indices of the objects, int `(n,)`, for each of `train`, `validation` and `test`.
     """
@@ -127,6 +131,13 @@ def split_objects(collection: Collection) -> dict[str, np.ndarray]:
             blocks[i if len(alike) >= len(blocks) - 1 else (2 * i + 1) * len(blocks) // (2 * len(alike))].append(index)
     order = np.concatenate([rng.permutation(block) for block in blocks])
     cuts = np.round(np.cumsum(collection.shares)[:-1] * collection.num_objects).astype(int)
+    sizes = np.diff(cuts, prepend=0, append=collection.num_objects)
+    wanted = np.array(collection.shares) > 0
+    if collection.num_objects >= 3 * LEAST and (collection.meshes is not None or sizes[wanted].min() == 1):
+        while sizes[wanted].min() < LEAST:
+            sizes[np.where(wanted, sizes, np.inf).argmin()] += 1
+            sizes[sizes.argmax()] -= 1
+        cuts = np.cumsum(sizes)[:-1]
     return {name: np.sort(part).astype(np.int64) for name, part in zip(PARTS, np.split(order, cuts), strict=True)}
 
 

@@ -156,7 +156,7 @@ def told_apart(
         from sklearn.preprocessing import StandardScaler
         from threadpoolctl import threadpool_limits
     except ImportError as error:
-        raise ImportError("the classifier needs the package scikit-learn: pip install -e '.[bench]'") from error
+        raise ImportError("the classifier needs two packages: pip install scikit-learn threadpoolctl") from error
     _matched(real, simulated, real_group, simulated_group, least=FOLDS)
     x, group = np.concatenate([real, simulated]), np.r_[real_group, simulated_group]
     is_real = np.arange(len(x)) < len(real)

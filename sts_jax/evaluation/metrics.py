@@ -246,6 +246,8 @@ def bootstrap(
 ) -> np.ndarray:
     """Compute a statistic for bootstrap samples, in which whole groups of items are drawn with replacement.
 
+    The result is NaN if there is only one group, because one group does not show how much groups vary.
+
     Args:
         groups: Group of each item, such as its object, `(n,)`.
         statistic: Function of the weights of the items, `(n,)`: how often the group of each item was drawn.
@@ -254,13 +256,22 @@ def bootstrap(
     _, member = np.unique(groups, return_inverse=True)
     size = member.max() + 1
     draws = rng.multinomial(size, np.full(size, 1 / size), size=num)
-    return np.stack([statistic(draw[member].astype(np.float64)) for draw in draws])
+    values = np.stack([statistic(draw[member].astype(np.float64)) for draw in draws])
+    return values if size > 1 else values * np.nan
 
 
 def interval(draws: np.ndarray) -> tuple[float, float]:
-    """Compute the 2.5 % and 97.5 % quantiles of bootstrap values. NaN is ignored."""
-    low, high = np.nanpercentile(draws, [2.5, 97.5])
+    """Compute the 2.5 % and 97.5 % quantiles of bootstrap values, (n,). NaN is ignored, and NaN if all are NaN."""
+    finite = draws[~np.isnan(draws)]
+    low, high = np.percentile(finite, [2.5, 97.5]) if len(finite) else (np.nan, np.nan)
     return float(low), float(high)
+
+
+def written(value: float, low: float | None, high: float | None, digits: int, factor: float = 1) -> str:
+    """Write a value with its interval, each times `factor`: "0.50 [0.41, 0.58]", or "0.50 [-]" without an interval."""
+    if low is None or high is None or not low <= high:
+        return f"{factor * value:.{digits}f} [-]"
+    return f"{factor * value:.{digits}f} [{factor * low:.{digits}f}, {factor * high:.{digits}f}]"
 
 
 def _xlogx(x: np.ndarray) -> np.ndarray:

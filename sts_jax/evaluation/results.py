@@ -9,7 +9,7 @@ import numpy as np
 from sts_jax import physics
 from sts_jax.dataset import Pairs
 from sts_jax.evaluation.catalogue import COLUMNS, LOG_LOSS, METRICS, Column, Metric, Scores
-from sts_jax.evaluation.metrics import bootstrap, image_error, interval, ratio, skill
+from sts_jax.evaluation.metrics import bootstrap, image_error, interval, ratio, skill, written
 from sts_jax.evaluation.predictions import Predicted, in_unit
 from sts_jax.evaluation.predictions import frequency as frequency_of
 from sts_jax.evaluation.references import BASELINES, CEILINGS, CONSTANT, COPY, Streams
@@ -110,7 +110,7 @@ def summarise(
     Returns:
         A dictionary that can be written as JSON, with the following entries. Each metric is a dictionary of `value` and
         of the limits `low` and `high` of its 95 % bootstrap interval over objects, or None if the predictor does not
-        have the metric.
+        have the metric. The limits are None if all items of the metric are of one object.
 
         - `items`: Number of items.
         - `objects`: Number of different objects among the items.
@@ -147,6 +147,13 @@ def summarise(
 
     value = numbers(np.ones(items))
     draws = bootstrap(test.object, numbers, num=num, seed=seed)
+    for i, count in enumerate(scored.values()):
+        first = test.take(slice(count))
+        for k, metric in enumerate(metrics):
+            if statistics[i][k] is not None:
+                counted = slice(None) if metric.items is None else metric.items(first)
+                if len(np.unique(first.object[counted])) < 2:
+                    draws[:, i, k] = np.nan
 
     def cells(values: np.ndarray, sample: np.ndarray) -> dict:
         return {key: _cell(values[k], sample[:, k]) for k, key in enumerate(keys)}
@@ -255,10 +262,7 @@ def _of_stream(predictions: Mapping[str, Predicted], test: Streams, stream: str,
 
     value, draws = numbers(np.ones(len(truth))), bootstrap(np.arange(len(truth)), numbers, num=num, seed=seed)
     cells = {
-        name: {
-            key: dict(zip(("value", "low", "high"), (float(value[i, k]), *interval(draws[:, i, k])), strict=True))
-            for k, key in enumerate(("bce", "skill", "skill_copy"))
-        }
+        name: {key: _cell(value[i, k], draws[:, i, k]) for k, key in enumerate(("bce", "skill", "skill_copy"))}
         for i, name in enumerate(errors)
     }
     return {"floor": ratio(constant.bce - constant.excess, constant.pixels), "predictors": cells}
@@ -268,7 +272,7 @@ def _cell(number: float, sample: np.ndarray) -> dict | None:
     """A value and its interval from bootstrap samples, or None if the value is not finite."""
     if not np.isfinite(number):
         return None
-    low, high = interval(sample)
+    low, high = (None if np.isnan(limit) else limit for limit in interval(sample))
     return {"value": float(number), "low": low, "high": high}
 
 
@@ -332,8 +336,8 @@ def _shown(cells: Mapping[str, dict | None], metric: Metric, *, interval: bool) 
     cell = cells[metric.name]
     if cell is None:
         return "-"
-    value, low, high = (f"{cell[key] * metric.factor:.{metric.digits}f}" for key in ("value", "low", "high"))
-    return f"{value} [{low}, {high}]" if interval else value
+    text = written(**cell, digits=metric.digits, factor=metric.factor)
+    return text if interval else text.partition(" ")[0]
 
 
 def _directions(compared: Sequence[Metric]) -> str:
@@ -355,6 +359,8 @@ def _page(summary: dict, title: str, metrics: Sequence[Metric], lines: Sequence[
         f"{summary['items']} held-out trajectories of {summary['objects']} objects ({outcomes}). Brackets contain "
         "95 % bootstrap intervals over objects."
     )
+    if any("[-]" in line for line in (*lines, *notes)):
+        text += " [-] stands for no interval, because all items are of one object."
     fewer = [
         f'The metrics of "{name}" are over the first {count} trajectories.'
         for name, count in summary["scored"].items()

@@ -55,7 +55,7 @@ def library(
     """List the objects of a folder without opening a mesh, sorted by class and name.
 
     Objects longer than 0.12 m are scaled down to this length, and meshes of more than 4,096 faces or vertices are
-    decimated, which needs the package fast-simplification.
+    decimated.
 
     If the folder or one of its direct sub-folders contains ShapeNetSem's metadata.csv, this table lists the objects,
     with their size, orientation and class. Meshes are expected at models-OBJ/models/ID.obj, and images in

@@ -94,7 +94,7 @@ def load(
         texture: Image file that replaces the file's own textures. It needs texture coordinates in the mesh.
         textures: Additional folder in which the file's images are looked up.
         faces: Largest number of faces and of vertices, at least 4. A larger mesh is decimated with a warning, and its
-            texture is replaced by one colour at each corner of each face. This needs the package fast-simplification.
+            texture is replaced by one colour at each corner of each face.
         parts: If True, the body collides as convex parts (`decompose`). This needs the package coacd.
         category: Index into CATEGORIES, or -1 for an object of no category.
     """

@@ -23,9 +23,7 @@ def convex_parts(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3
     try:
         import coacd
     except ImportError as error:
-        raise ImportError(
-            "convex parts need the package coacd, which is not installed: pip install -e '.[meshes]'"
-        ) from error
+        raise ImportError("convex parts need the package coacd, which is not installed: pip install coacd") from error
     coacd.set_log_level("off")
     try:
         pieces = coacd.run_coacd(

@@ -71,13 +71,8 @@ def surface_samples(
 
 def decimate(path: Path, surface: Surface, target: int) -> Surface:
     """Reduce a surface to at most `target` faces and vertices, with one colour per corner of a face. Warns."""
-    try:
-        import fast_simplification
-    except ImportError as error:
-        raise ImportError(
-            f"{path}: decimating the mesh from {len(surface.faces):,} to {target:,} faces needs the package "
-            "fast-simplification, which is not installed: pip install -e '.[meshes]'"
-        ) from error
+    import fast_simplification  # takes half a second
+
     # Slivers can block the decimation. If so, vertices are welded first, on a grid of 1/1000 of the size or coarser.
     for weld in (0.0, 1e-3, 2e-3, 4e-3, 8e-3):
         vertices, faces = _welded(surface, weld)
