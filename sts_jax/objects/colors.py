@@ -4,6 +4,7 @@ import numpy as np
 
 Number = float | int
 Color = np.ndarray
+PLAIN = 0.7  # sRGB grey of a mesh without colours
 
 
 def linear(srgb: np.ndarray) -> np.ndarray:

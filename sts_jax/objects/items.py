@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sts_jax.objects.body import FACE_CLASSES, HULL_CLASSES, PART_CLASSES, TEXTURE_CLASSES, Body
-from sts_jax.objects.materials import references
+from sts_jax.objects.formats import references
 from sts_jax.storage import write_arrays
 
 LARGEST = 0.12  # m, larger objects are scaled down to this longest side, so that they can lie on the pad of 0.15 m
@@ -66,14 +66,11 @@ def cache_path(library: Library, item: Item) -> Path:
     settings = [item.scale, item.up, item.front, item.label, item.notes]
     layout = [_FORMAT, fields, FACE_CLASSES, HULL_CLASSES, PART_CLASSES, TEXTURE_CLASSES]
     digest.update(json.dumps([layout, settings, NUM_FACES, LARGEST, library.parts]).encode())
-    try:
-        named = references(item.path, item.textures)
-    except (OSError, ValueError):
-        named = {}  # `load` raises an error for the damaged file
     if not item.path.is_file():
         raise FileNotFoundError(
             f"{item.path}: no such mesh file: restore it, or call objects.library() again to list the existing files"
         )
+    named = references(item.path, item.textures)
     for name, path in [(item.path.name, item.path), *sorted(named.items())]:
         digest.update(name.encode() + b"\0" + (b"" if path is None else hashlib.sha256(path.read_bytes()).digest()))
     return library.cache / f"{digest.hexdigest()[:32]}.npz"

@@ -1,8 +1,5 @@
-"""Colours and textures of mesh files, and the material and image files to which mesh files refer."""
+"""Colours and textures of mesh files."""
 
-import json
-import re
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -10,80 +7,8 @@ import trimesh
 from PIL import Image
 
 from sts_jax.objects.body import TEXTURE_CLASSES
-from sts_jax.objects.colors import linear
-
-PLAIN = 0.7  # sRGB grey of a mesh without colours
-
-
-def references(path: Path, images: Path | None = None) -> dict[str, Path | None]:
-    """Map the names in an OBJ file (materials, `map_Kd`) or in a glTF to paths, or to None where a file is missing."""
-    if path.suffix.lower() == ".gltf":
-        tree = json.loads(path.read_text())
-        names = [part.get("uri", "data:") for key in ("buffers", "images") for part in tree.get(key, [])]
-        return {name: _find(path.parent, name, images) for name in names if not name.startswith("data:")}
-    if path.suffix.lower() != ".obj":
-        return {}
-    files = {name: _find(path.parent, name, None) for name in _named(path, "mtllib")}
-    for library in [library for library in files.values() if library is not None]:
-        files |= {name: _find(path.parent, name, images) for name in _named(library, "map_kd")}
-    return files
-
-
-def check_materials(path: Path, images: Path | None, strict: bool) -> None:
-    """Check the materials and images of an OBJ, because trimesh silently ignores missing and damaged ones.
-
-    A missing file is a warning, or an error if `strict`.
-    """
-    if path.suffix.lower() != ".obj":
-        return
-    files = references(path, images)
-    missing = ", ".join(str(path.parent / name) for name, file in files.items() if file is None)
-    if missing:
-        problem = f"{path}: the mesh refers to missing files: {missing}. Add them, or give an image (argument texture)"
-        if strict:
-            raise FileNotFoundError(problem)
-        warnings.warn(problem, stacklevel=3)
-    for file in files.values():
-        if file is not None and file.suffix.lower() != ".mtl":
-            read_image(file)
-
-
-def read_image(path: Path) -> Image.Image:
-    """Read an image file as RGB."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such image file: check the path")
-    try:
-        with Image.open(path) as picture:
-            return picture.convert("RGB")
-    except (OSError, SyntaxError) as error:
-        raise ValueError(f"{path}: the file cannot be read as an image ({error}): replace the file") from error
-
-
-class Resolver(trimesh.resolvers.FilePathResolver):
-    """Gives trimesh the files to which a mesh file refers, also from the folder `images`."""
-
-    def __init__(self, path: Path, images: Path) -> None:
-        super().__init__(str(path))
-        self.images = images
-
-    def get(self, name: str) -> bytes:
-        """Return the content of the file to which the mesh file refers by `name`."""
-        path = _find(Path(self.parent), name, self.images)
-        return super().get(name) if path is None else path.read_bytes()
-
-
-def _find(folder: Path, name: str, images: Path | None) -> Path | None:
-    """Find a file that a mesh file in `folder` refers to: by its relative path, or by its base name in `images`."""
-    name = name.strip().replace("\\", "/")
-    places = [folder / name] + ([] if images is None else [images / Path(name).name])
-    return next((place for place in places if place.is_file()), None)
-
-
-def _named(file: Path, word: str) -> list[str]:
-    """List the names that follow a keyword at the beginning of a line in an OBJ or MTL file."""
-    return re.findall(
-        rf"^[ \t]*{word}[ \t]+(\S.*?)\s*$", file.read_text(errors="replace"), re.IGNORECASE | re.MULTILINE
-    )
+from sts_jax.objects.colors import PLAIN, linear
+from sts_jax.objects.files import rgb
 
 
 def albedo(path: Path, pieces: list[trimesh.Trimesh]) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
@@ -99,8 +24,8 @@ def albedo(path: Path, pieces: list[trimesh.Trimesh]) -> tuple[np.ndarray, np.nd
     if not pictures:
         return np.concatenate(colors), np.concatenate(uvs), None
     try:
-        sheets = [np.asarray(picture.convert("RGB")) for picture in pictures]
-    except (OSError, SyntaxError) as error:
+        sheets = [np.asarray(rgb(picture)) for picture in pictures]
+    except (OSError, SyntaxError, ValueError) as error:
         raise ValueError(f"a texture of the mesh cannot be read ({error}): replace the texture") from error
     distinct: list[np.ndarray] = []
     cell = []

@@ -15,8 +15,10 @@ from sts_jax._checked import checked
 from sts_jax.objects.assembly import CONTENTS, WALL, assemble
 from sts_jax.objects.body import FACE_CLASSES, PAD, SMALLEST, Body, check_category
 from sts_jax.objects.checks import check_file, check_positive, check_side, checked_corners
+from sts_jax.objects.files import Files, read_image
+from sts_jax.objects.formats import read
 from sts_jax.objects.hulls import convex_hull
-from sts_jax.objects.materials import Resolver, albedo, check_materials, read_image
+from sts_jax.objects.materials import albedo
 from sts_jax.objects.parts import decompose
 from sts_jax.objects.surface import Surface, decimate, is_closed, merge
 
@@ -113,9 +115,7 @@ def load(
         turn = _attitude(up, front)
         check_file(path)
         images = None if textures is None else Path(textures)
-        if texture is None:
-            check_materials(path, images, strict)
-        pieces = _read(path, images)
+        pieces = read(Files(path, images, plain=texture is not None), strict)
         corners = checked_corners(pieces, faces) @ turn.T
         if texture is not None:
             _wear(pieces, Path(texture))
@@ -137,24 +137,6 @@ def _attitude(
     if front is not None:
         raise ValueError(f"with up={up!r} and front={front}: give an axis x, y or z without front, or two directions")
     return rotation(*AXES[up])
-
-
-def _read(path: Path, images: Path | None) -> list[trimesh.Trimesh]:
-    """Read the meshes of a file."""
-    try:
-        # trimesh opens the images itself, so only a resolver can make it look in a separate folder of images.
-        resolver = None if images is None else Resolver(path, images)
-        scene = trimesh.load_scene(path, process=False, resolver=resolver)
-        return [piece for piece in scene.dump() if isinstance(piece, trimesh.Trimesh) and len(piece.faces)]
-    except ModuleNotFoundError as error:
-        # For text that is not UTF-8, trimesh imports a package that is not one of its requirements.
-        damaged = error.name == "charset_normalizer"
-        remedy = "the file is truncated or damaged: replace it" if damaged else f"install the package {error.name}"
-        raise ValueError(f"the file cannot be read as a mesh ({error}): {remedy}") from error
-    except Exception as error:  # trimesh's many readers raise errors of many types
-        raise ValueError(
-            f"the file cannot be read as a mesh ({error}): check that it is complete and has the right suffix"
-        ) from error
 
 
 def _wear(pieces: list[trimesh.Trimesh], texture: Path) -> None:
