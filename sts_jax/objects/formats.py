@@ -2,7 +2,6 @@
 
 import base64
 import io
-import itertools
 import json
 import re
 import struct
@@ -18,6 +17,7 @@ from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from sts_jax.objects.colors import PLAIN
 from sts_jax.objects.files import Files, Refusal, read_image
+from sts_jax.objects.polygons import cut, cut_off, cut_ply
 
 # glTF extensions that may be required, besides the materials (KHR_materials_...), which do not change the base colour.
 SUPPORTED = ("KHR_texture_transform", "EXT_texture_webp", "KHR_lights_punctual", "KHR_xmp_json_ld")
@@ -205,12 +205,16 @@ def _obj(data: bytes, files: Files) -> list[trimesh.Trimesh]:
     pictures: dict[bytes | None, Image.Image | None] = {}
     pieces = []
     for (name, has_texels), polygons in reversed(groups.items()):
-        faces = np.array([corner for polygon in polygons for corner in _triangles(polygon)], np.int64).reshape(-1, 3, 2)
-        if faces[..., 0].max() >= len(place):
-            number = faces[..., 0].max() + 1
+        number, coordinate = np.max([corner for polygon in polygons for corner in polygon], axis=0) + 1
+        if number > len(place):
             raise Refusal(f"a face refers to vertex {number}, but the file has {len(place)} vertices: is it complete?")
-        if has_texels and len(texel) <= faces[..., 1].max():
-            raise Refusal(f"a face refers to texture coordinate {faces[..., 1].max() + 1} of {len(texel)}: repair it")
+        if has_texels and coordinate > len(texel):
+            raise Refusal(f"a face refers to texture coordinate {coordinate} of {len(texel)}: repair it")
+        for row, polygon in enumerate(polygons):
+            if len(polygon) > 3:
+                triangles = cut(place[[corner[0] for corner in polygon], :3])
+                polygons[row] = [polygon[corner] for corner in triangles.ravel()]
+        faces = np.array([corner for polygon in polygons for corner in polygon], np.int64).reshape(-1, 3, 2)
         used, index = np.unique(faces[..., 0] * (len(texel) + 1) + faces[..., 1] + 1, return_inverse=True)
         vertex, corner = np.divmod(used, len(texel) + 1)
         look = looks.get(name or b"")
@@ -256,12 +260,6 @@ def _index(text: bytes, number: int) -> int:
     return index - 1 if index > 0 else number + index
 
 
-def _triangles(polygon: list[tuple[int, int]]) -> Iterator[tuple[int, int]]:
-    """Split a polygon into triangles with a common corner."""
-    for second, third in itertools.pairwise(polygon[1:]):
-        yield from (polygon[0], second, third)
-
-
 def _numbers(rows: list[list[bytes]], least: int, what: str) -> np.ndarray:
     """Make an array of rows that have at least `least` numbers each."""
     columns = min(map(len, rows), default=least)
@@ -299,7 +297,7 @@ def _ply(data: bytes, files: Files) -> list[trimesh.Trimesh]:
     if re.search(rb"(?m)^format\s+ascii", head):
         body = re.sub(rb"\r\n?", b"\n", body)
     bare = re.sub(rb"(?m)^(comment|obj_info).*\n", b"", head)
-    pieces = _loaded(bare + end + body, "ply", files)
+    pieces = _loaded(cut_ply(bare + end + body), "ply", files)
     names = [] if files.plain else re.findall(_TEXTURE, head)
     picture = files.image(names[0]) if names else None
     for piece in pieces if picture is not None else []:
@@ -312,7 +310,7 @@ def _ply(data: bytes, files: Files) -> list[trimesh.Trimesh]:
 
 def _off(data: bytes, files: Files) -> list[trimesh.Trimesh]:
     """Read an OFF with trimesh, which expects UTF-8."""
-    return _loaded(_text(data).decode("latin-1").encode(), "off", files)
+    return _loaded(cut_off(_text(data)), "off", files)
 
 
 def _header(data: bytes) -> tuple[dict[str, Any], bytes]:

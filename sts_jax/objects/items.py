@@ -16,7 +16,7 @@ from sts_jax.storage import write_arrays
 
 LARGEST = 0.12  # m, larger objects are scaled down to this longest side, so that they can lie on the pad of 0.15 m
 NUM_FACES = 4096  # the largest size class whose rendering is cheap, larger meshes are decimated
-_FORMAT = 1  # version of cached bodies, increased when the same file and settings lead to another body
+_FORMAT = 2  # version of cached bodies, increased when the same file and settings lead to another body
 
 Vector = tuple[float, float, float]
 

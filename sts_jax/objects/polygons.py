@@ -1,0 +1,149 @@
+"""Polygons of mesh files as triangles, by ear clipping, because trimesh splits concave polygons wrongly."""
+
+import io
+import struct
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from sts_jax.objects.files import Refusal
+
+# Types of a PLY file, as codes of `struct`.
+_CODES = {
+    **{"char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I", "float": "f", "double": "d"},
+    **{"int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "int64": "q"},
+    **{"uint64": "Q", "float16": "e", "float32": "f", "float64": "d"},
+}
+
+
+def cut(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "_ 3"]:
+    """Corners of the triangles of a polygon, which may be concave, slightly bent, and touch itself.
+
+    All corners remain, so that neighbouring polygons still share their edges. A repetition of a polygon has the same
+    triangles, also with another first corner or in the opposite direction.
+    """
+    num = len(points)
+    fan = np.stack([np.zeros(max(num - 2, 0), int), np.arange(1, num - 1), np.arange(2, num)], axis=1)
+    if num <= 3 or not np.isfinite(points).all():
+        return fan
+    ring = np.roll(np.arange(num), -np.lexsort(points.T[::-1])[0])
+    backwards = tuple(points[ring[1]]) > tuple(points[ring[-1]])
+    if backwards:
+        ring = np.roll(ring[::-1], 1)
+    corners = points[ring] - points[ring[0]]
+    normal = np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0)  # twice the area (Newell)
+    area, grain = np.linalg.norm(normal), 1e-12 * np.ptp(corners, axis=0).max() ** 2
+    if (np.cross(corners[1:-1], corners[2:]) @ normal >= -grain * area).all() and area > grain:
+        return ring[fan[:, ::-1] if backwards else fan]  # convex
+    x, y = np.linalg.svd(normal[None])[2][1:] if area > grain else np.linalg.svd(corners)[2][:2]
+    plane = corners @ np.stack([x, y if np.cross(x, y) @ normal >= 0 else -y], axis=1)
+    triangles = _ears(plane, grain)
+    if np.abs(_areas(plane, triangles)).sum() > (1 + 1e-3) * area + 1e6 * grain:
+        raise Refusal(f"a face of {num} corners near {points[0]} crosses itself: split it into triangles")
+    return ring[triangles[:, ::-1] if backwards else triangles]
+
+
+def _areas(plane: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Twice the signed areas of triangles in a plane."""
+    a, b, c = np.moveaxis(plane[triangles], -2, 0)
+    return _cross(b - a, c - a)
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def _ears(plane: np.ndarray, grain: float) -> np.ndarray:
+    """Triangles of a counter-clockwise polygon by ear clipping: cut off a convex corner that contains no other."""
+    left, triangles = list(range(len(plane))), []
+    while len(left) > 3:
+        b = plane[left]
+        a, c = np.roll(b, 1, axis=0), np.roll(b, -1, axis=0)
+        turn = _cross(b - a, c - b)
+        back = (np.abs(turn) <= grain) & (np.einsum("nk,nk->n", b - a, c - b) <= 0)  # repeated corners and spikes
+        convex = np.flatnonzero(turn > grain)
+        order = convex[np.argsort(((c - a) ** 2).sum(axis=1)[convex], kind="stable")]
+        ears = np.flatnonzero(back)[:1].tolist()
+        for margin in (-grain, grain):  # corners on an edge of the triangle only count at first
+            ears = ears or next(([i] for i in order if not _contains(a[i], b[i], c[i], b, margin)), [])
+        ear = ears[0] if ears else int(np.argmax(turn))
+        triangles.append([left[ear - 1], left[ear], left[(ear + 1) % len(left)]])
+        del left[ear]
+    return np.array([*triangles, left])
+
+
+def _contains(a: np.ndarray, b: np.ndarray, c: np.ndarray, points: np.ndarray, margin: float) -> bool:
+    """Return whether a triangle contains any point that is not at its corners."""
+    inside = [_cross(end - start, points - start) > margin for start, end in ((a, b), (b, c), (c, a))]
+    corner = [np.abs(points - place).max(axis=1) <= np.sqrt(abs(margin)) for place in (a, b, c)]
+    return bool((np.all(inside, axis=0) & ~np.any(corner, axis=0)).any())
+
+
+def cut_off(content: bytes) -> bytes:
+    """Cut the polygons of an OFF file."""
+    lines = [line.split("#")[0].strip() for line in content.decode("latin-1").splitlines()]
+    head, *lines = [line for line in lines if line]
+    kind, *counts = head.split()
+    if not counts:
+        counts = lines.pop(0).split()
+    num, faces = int(counts[0]), []
+    vertices = lines[:num]
+    points = np.array([line.split()[:3] for line in vertices], float)
+    for line in lines[num : num + int(counts[1])]:
+        size, *rest = line.split()
+        index = np.array(rest[: int(size)], int)
+        faces += ["3 " + " ".join(map(str, index[face])) for face in cut(points[index])]
+    return "\n".join([kind, f"{num} {len(faces)} 0", *vertices, *faces]).encode("latin-1")
+
+
+def cut_ply(content: bytes) -> bytes:
+    """Cut the polygons of a PLY file. Further lists of a face, such as texture coordinates, follow its corners."""
+    head, _, body = content.partition(b"end_header")
+    lines = [line.split() for line in head.decode("latin-1").splitlines()]
+    layout: dict[str, list[list[str]]] = {}  # the words of each property: [list, uchar, int, name] or [float, name]
+    count: dict[str, int] = {}
+    for words in lines:
+        if words[:1] == ["element"]:
+            name, count[words[1]], layout[words[1]] = words[1], int(words[2]), []
+        elif words[:1] == ["property"]:
+            layout[name].append(words[1:])
+    read = _reader(body[body.find(b"\n") + 1 :], next(words[1] for words in lines if words[:1] == ["format"]))
+
+    def values(words: list[str]) -> list[Any]:
+        return [read(words[-2]) for _ in range(read(words[1]) if words[0] == "list" else 1)]
+
+    rows = {name: [[values(words) for words in layout[name]] for _ in range(count[name])] for name in layout}
+    lists = [k for k, words in enumerate(layout.get("face", [])) if words[0] == "list"]
+    corners = next((k for k in lists if layout["face"][k][-1].startswith("vertex_ind")), *lists[:1])
+    if all(len(row[corners]) == 3 for row in rows.get("face", [])):
+        return content
+    names = [words[-1] for words in layout["vertex"]]
+    places = np.array([[row[names.index(axis)][0] for axis in "xyz"] for row in rows["vertex"]], float)
+    triangles = []
+    for row in rows["face"]:
+        num = len(row[corners])
+        for triangle in cut(places[row[corners]]):
+            copy = list(row)
+            for k in [k for k in lists if num and len(row[k]) % num == 0]:
+                copy[k] = np.reshape(row[k], (num, -1))[triangle].ravel().tolist()
+            triangles.append(copy)
+    rows["face"] = triangles
+    top = [["format", "binary_little_endian", "1.0"] if words[:1] == ["format"] else words for words in lines]
+    top = [["element", "face", str(len(triangles))] if words[:2] == ["element", "face"] else words for words in top]
+    out = ["\n".join(map(" ".join, top)).encode("latin-1"), b"\nend_header\n"]
+    for name, kinds in layout.items():
+        for words, value in ((words, value) for row in rows[name] for words, value in zip(kinds, row, strict=True)):
+            size = struct.pack("<" + _CODES[words[1]], len(value)) if words[0] == "list" else b""
+            out.append(size + struct.pack(f"<{len(value)}{_CODES[words[-2]]}", *value))
+    return b"".join(out)
+
+
+def _reader(body: bytes, form: str) -> Callable[[str], Any]:
+    """Return a function that reads the next number of a type from the body of a PLY file."""
+    if form == "ascii":
+        tokens = iter(body.split())
+        return lambda kind: (float if _CODES[kind] in "efd" else int)(float(next(tokens, b"")))
+    stream, order = io.BytesIO(body), ">" if "big" in form else "<"
+    return lambda kind: struct.unpack(order + _CODES[kind], stream.read(struct.calcsize(order + _CODES[kind])))[0]

@@ -1,0 +1,126 @@
+"""Geometry of mesh files: polygons, orientation, repeated faces, thick walls, size and mass."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from object_files import surface
+
+from sts_jax import objects
+from sts_jax.objects.polygons import cut
+
+# Outlines (mm), counter-clockwise: concave, with straight and repeated corners, with a hole, and touching itself.
+OUTLINES = {
+    "letter": [[0, 0], [60, 0], [60, 15], [15, 15], [15, 45], [60, 45], [60, 60], [0, 60]],
+    "dart": [[10, 10], [0, 40], [0, 0], [40, 0]],
+    "straight": [[0, 0], [20, 0], [30, 0], [30, 30], [15, 10], [0, 30], [0, 20], [0, 10]],
+    "repeated": [[0, 0], [40, 0], [40, 0], [10, 10], [10, 10], [0, 40], [0, 40]],
+    "hole": [[0, 0], [40, 0], [40, 40], [0, 40], [0, 0], [10, 10], [10, 30], [30, 30], [30, 10], [10, 10]],
+    "bridge": [
+        [0, 0],
+        [40, 0],
+        [40, 40],
+        [0, 40],
+        [0, 20],
+        [8, 20],
+        [8, 30],
+        [32, 30],
+        [32, 10],
+        [8, 10],
+        [8, 20],
+        [0, 20],
+    ],
+    "touching": [[0, 0], [40, 0], [40, 40], [20, 0], [0, 40]],
+}
+
+
+def volume(body: objects.Body) -> float:
+    """Volume that the contents can fill (m^3)."""
+    return float(np.linalg.det(np.asarray(body.interior, float)).sum()) / 6
+
+
+def shoelace(outline: np.ndarray) -> float:
+    x, y = outline.T
+    return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
+
+
+def prism(outline: list[list[int]], height: float = 0.01) -> tuple[np.ndarray, list[list[int]]]:
+    """Vertices (m) and polygons of a prism over an outline (mm)."""
+    flat = np.array(outline, float) * 1e-3
+    low, number = np.c_[flat, np.zeros(len(flat))], len(flat)
+    sides = [[i, (i + 1) % number, number + (i + 1) % number, number + i] for i in range(number)]
+    return np.concatenate([low, np.add(low, [0, 0, height])]), [
+        list(range(number))[::-1],
+        list(range(number, 2 * number)),
+        *sides,
+    ]
+
+
+def write(path: Path, vertices: np.ndarray, polygons: list[list[int]]) -> Path:
+    """Write polygons as OBJ, OFF, PLY in ASCII (.a.ply) or binary PLY."""
+    rows = [" ".join(map(repr, map(float, vertex))) for vertex in vertices]
+    sized = [" ".join(map(str, [len(polygon), *polygon])) for polygon in polygons]
+    head = [f"element vertex {len(rows)}", *(f"property float {axis}" for axis in "xyz")]
+    head += [f"element face {len(sized)}", "property list uchar int vertex_indices", "end_header"]
+    if path.suffix == ".obj":
+        counted = [[i - len(rows) for i in polygon] for polygon in polygons[:2]]  # indices that count backwards
+        counted += [[i + 1 for i in polygon] for polygon in polygons[2:]]
+        path.write_text("\n".join([*("v " + row for row in rows), *("f " + " ".join(map(str, f)) for f in counted)]))
+    elif path.suffix == ".off":
+        path.write_text("\n".join(["OFF", f"{len(rows)} {len(sized)} 0", *rows, *sized]))
+    elif ".a." in path.name:
+        path.write_text("\n".join(["ply", "format ascii 1.0", *head, *rows, *sized]) + "\n")
+    else:
+        faces = (struct.pack(f">B{len(polygon)}i", len(polygon), *polygon) for polygon in polygons)
+        top = "\n".join(["ply", "format binary_big_endian 1.0", *head]).encode() + b"\n"
+        path.write_bytes(top + vertices.astype(">f4").tobytes() + b"".join(faces))
+    return path
+
+
+@pytest.mark.parametrize("kind", ["x.obj", "x.off", "x.a.ply", "x.ply"])
+@pytest.mark.parametrize("name", OUTLINES)
+def test_a_prism_over_a_concave_outline_has_the_volume_and_area_of_its_formula(tmp_path, name, kind):
+    outline = np.array(OUTLINES[name]) * 1e-3
+    body = objects.load(write(tmp_path / kind, *prism(OUTLINES[name])), density=2.0, strict=True)
+    around = np.linalg.norm(outline - np.roll(outline, -1, axis=0), axis=1).sum()
+    np.testing.assert_allclose(volume(body), shoelace(outline) * 0.01, rtol=1e-4)
+    np.testing.assert_allclose(body.shell_mass, 2 * (2 * shoelace(outline) + around * 0.01), rtol=1e-4)
+
+
+def test_any_polygon_is_cut_whatever_its_plane_and_bend():
+    rng = np.random.default_rng(0)
+    angle = np.sort(rng.uniform(0, 2 * np.pi, 80))
+    star = np.stack([np.cos(angle), np.sin(angle)], axis=1) * rng.uniform(0.3, 1, (80, 1))
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    for bend, exact in ((0.0, 1e-9), (0.05, 0.05)):
+        points = np.c_[star, bend * star[:, 0] ** 2] @ turn.T + 5
+        triangles = points[cut(points)]
+        area = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
+        assert area.sum() / 2 == pytest.approx(shoelace(star), rel=exact)
+        same = {frozenset(map(tuple, triangle)) for triangle in triangles}
+        for again in (np.roll(points, 7, axis=0), points[::-1]):
+            assert {frozenset(map(tuple, triangle)) for triangle in again[cut(again)]} == same
+
+
+def test_a_polygon_that_crosses_itself_is_refused(tmp_path):
+    vertices, polygons = prism([[0, 0], [40, 40], [40, 0], [0, 30]])
+    with pytest.raises(ValueError, match=r"x\.obj: .*a face of 4 corners near .* crosses itself: split it"):
+        objects.load(write(tmp_path / "x.obj", vertices, polygons))
+
+
+def test_the_triangles_of_a_ply_polygon_keep_its_colours(tmp_path):
+    vertices, polygons = prism(OUTLINES["letter"])
+    path = write(tmp_path / "x.a.ply", vertices, polygons)
+    text = path.read_text().replace(
+        "end_header", "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header"
+    )
+    lines = text.splitlines()
+    first = len(lines) - len(polygons)
+    lines[first:] = [f"{line} {255 * (row == 1)} 0 {255 * (row != 1)}" for row, line in enumerate(lines[first:])]
+    path.write_text("\n".join(lines) + "\n")
+    body = objects.load(path)
+    drawn = surface(body)
+    top = (drawn.triangles[..., 2] > drawn.vertices[:, 2].mean()).all(axis=1)
+    np.testing.assert_allclose(np.asarray(body.colors)[: len(top), :, 0], np.tile(top[:, None], 3), atol=1e-6)
+    assert top.sum() == 6
