@@ -29,7 +29,7 @@ import tyro
 import sts_jax as sts
 from experiments.shared import table2, terminal
 from experiments.shared.collecting import Collect, Review, collect, review
-from experiments.shared.run import chosen_preset
+from experiments.shared.run import chosen_preset, options, with_epochs
 from experiments.shared.table2 import Config, Train
 from sts_jax.training import TrainConfig
 
@@ -53,13 +53,16 @@ def parse(words: Sequence[str]) -> Train | Collect | Review:
     """Read the options of the command line. Without a sub-command, `train` is used."""
     if not words or (words[0].startswith("-") and words[0] not in ("-h", "--help")):
         words = ["train", *words]
-    return tyro.cli(
+    config: Train | Collect | Review = tyro.cli(
         Annotated[Train, tyro.conf.subcommand("train", default=Train(chosen_preset(PRESETS, words)))]
         | Annotated[Collect, tyro.conf.subcommand("collect")]
         | Annotated[Review, tyro.conf.subcommand("review")],
         args=words,
         description=__doc__,
     )
+    if isinstance(config, Train):
+        return dataclasses.replace(config, config=with_epochs(config.config, options(words)))
+    return config
 
 
 def main(config: Train | Collect | Review) -> None:

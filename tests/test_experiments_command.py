@@ -2,9 +2,11 @@
 
 import dataclasses
 import re
+import sys
 import warnings
 from pathlib import Path
 
+import numpy as np
 import pytest
 import trimesh
 
@@ -114,6 +116,16 @@ def test_options_of_a_model_that_is_not_trained_are_noted(monkeypatch, capsys):
     assert capsys.readouterr().err == "note: --training.* has no effect, because --model statespace is trained\n"
     parsed(monkeypatch, "--training.learning-rate", "1e-3", "--model", "paper")
     assert capsys.readouterr().err == ""
+    parsed(monkeypatch, "--model", "paper", "--num-samples", "3")
+    assert capsys.readouterr().err == "note: --num-samples has no effect, because --model paper is trained\n"
+
+
+def test_epochs_and_steps_on_the_command_line_replace_the_steps_of_the_preset(monkeypatch):
+    assert parsed(monkeypatch, "--model", "paper", "--training.epochs", "3").config.steps is None
+    assert parsed(monkeypatch, "--model", "paper", "--training.steps=3").config.steps is None
+    assert parsed(monkeypatch, "--model", "paper", "--training.epochs", "3", "--steps", "1", "2", "3", "4").config.steps
+    assert parsed(monkeypatch, "--state-training.epochs", "3").config.state_training.steps is None
+    assert parsed(monkeypatch, "--state-training.epochs", "3", "--state-training.steps", "9").config.schedule.steps == 9
 
 
 @pytest.mark.parametrize(
@@ -231,6 +243,47 @@ def test_the_classes_of_the_experiment_or_the_requested_ones_are_taken_from_a_fo
     before = listing.stat().st_mtime_ns
     assert run.configure(args).collection == one
     assert listing.stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize(
+    ("options", "counts"),
+    [
+        ((), (24, 16)),  # as many trajectories as without a folder, 96, and two thirds of them with images
+        (("--collection.num-per-object", "6"), (6, 6)),  # the preset's own number
+        (("--collection.num_per_object=5", "--collection.num-rendered", "2"), (5, 2)),
+        (("--collection.num-rendered", "3"), (24, 3)),
+    ],
+)
+def test_explicit_numbers_win_over_those_for_a_folder(options, counts, folder, tmp_path, monkeypatch, capsys):
+    (folder / "bottle" / "4.stl").write_bytes((folder / "bottle" / "0.stl").read_bytes())  # the same mesh
+    presets = {"default": changed(config.Config(config.COLLECTION), {"num_objects": 16, "shares": (0.5, 0.25, 0.25)})}
+    monkeypatch.setattr("sys.argv", ["x", "--objects", str(folder), "--workdir", str(tmp_path / "run"), *options])
+    one = run.configure(run.parse(presets, "unused", None)).collection
+    assert (one.num_objects, one.num_per_object, one.rendered_per_object) == (4, *counts)
+    assert f"4 objects with {one.num_per_object} trajectories each, split into train 2, " in capsys.readouterr().err
+    monkeypatch.setattr("sys.argv", [*sys.argv, "--collection.num-objects", "9"])
+    with pytest.raises(ValueError, match="num_objects=9, but `meshes` has 4 objects"):
+        run.configure(run.parse(presets, "unused", None))
+
+
+def test_files_with_their_own_scale_are_read_again_from_the_collection(folder, tmp_path, monkeypatch):
+    options = (
+        "--objects",
+        str(folder),
+        "--workdir",
+        str(tmp_path / "run"),
+        "--scale",
+        "bottle/0.stl",
+        "0.5",
+        "box",
+        "2",
+    )
+    monkeypatch.setattr("sys.argv", ["x", *options])
+    one = run.configure(run.parse({"default": smoke_of_few(freefall)}, "unused", None)).collection
+    assert one.meshes.scale == (("bottle/0.stl", 0.5), ("box", 2.0))
+    first, second = dataset.make_bodies(one, np.array([0, 1]))
+    assert np.ptp(first.vertices, axis=0).max() == pytest.approx(0.03)
+    assert np.ptp(second.vertices, axis=0).max() == pytest.approx(0.07)
 
 
 def test_all_classes_are_taken_from_a_folder_without_those_of_the_experiment(folder, tmp_path):

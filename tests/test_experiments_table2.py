@@ -113,10 +113,11 @@ def test_the_models_are_trained_judged_and_resumed_on_a_device_without_adding_tr
     work = tmp_path / "work"
     record(work, 6)
     real.main(Train(TINY, work))
-    table = capsys.readouterr().out
-    assert (work / "table2" / "table.md").read_text() in table
+    printed, table = capsys.readouterr().out, (work / "table2" / "table.md").read_text()
     assert "6 trajectories, 5 for training and 1 for validation" in table
-    assert "the sensor camera" in table
+    assert "[-] stands for no interval, because only one trajectory is held out" in table
+    assert "1 held-out trajectories of the sensor camera" in printed
+    assert f"figures: {work / 'table2' / 'figures'}" in printed
     assert len(hardware.load_recordings(work / "dataset")) == 6
     assert {path.name for path in (work / "table2" / "figures").iterdir()} == {"predictions.png", "training.png"}
 
@@ -136,7 +137,8 @@ def test_the_models_are_trained_judged_and_resumed_on_a_device_without_adding_tr
     real.main(Train(TINY, work))
     assert (work / "table2" / "metrics.json").stat().st_mtime_ns == written
     (work / "table2" / "table.md").unlink()
-    assert table2.evaluate(TINY, images, work, work / "table2") in table
+    assert table2.evaluate(TINY, images, work, work / "table2") in printed
+    assert (work / "table2" / "table.md").read_text() == table
     assert identities == {name: evaluate.identity(work / "table2" / "models" / name) for name in table2.NAMES}
 
     with hardware.Session(work / "dataset") as session:

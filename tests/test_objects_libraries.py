@@ -203,6 +203,44 @@ def test_a_larger_object_is_scaled_down_with_a_note_and_cutlery_is_solid_and_of_
         np.testing.assert_allclose(objects.rigid(fork, fill, 1.0)[0], 5.9 * 2 * (4 + 0.2 + 0.8) * INCH**2, rtol=1e-5)
 
 
+@pytest.mark.parametrize("sizes", [(50.5, 0.093), (0.05, 25.0), (2.0, 0.04), (60.0, 40.0), (5.0,)])
+def test_a_folder_that_cannot_be_in_metres_needs_a_scale(tmp_path, sizes):
+    for number, side in enumerate(sizes):
+        box((side, 0.8 * side, 0.5 * side)).export(tmp_path / f"{number}.stl")
+    longest = f"{np.argmax(sizes)}.stl"
+    for cache in (None, tmp_path / "kept", tmp_path / "kept"):
+        listed = objects.library(tmp_path, cache=cache)
+        for load in (objects.survey, objects.bodies):
+            with pytest.raises(
+                ValueError, match=rf"in metres, {longest} would be .* m long.* --scale '{longest}' 0\.001"
+            ):
+                load(listed)
+    assert len(objects.bodies(objects.library(tmp_path, scale=1.0))[0]) == len(sizes)
+
+
+def test_large_things_in_metres_and_meshes_without_a_unit_are_scaled_down(tmp_path):
+    for number, side in enumerate((0.5, 2.0, 2.0)):
+        box((side, 0.8 * side, 0.5 * side)).export(tmp_path / f"{number}.stl")
+    made, _ = objects.bodies(objects.library(tmp_path))
+    np.testing.assert_allclose([np.ptp(np.asarray(body.vertices), axis=0).max() for body in made], 0.12, rtol=1e-5)
+
+
+def test_files_and_sub_folders_have_their_own_scale(tmp_path):
+    (tmp_path / "gripper").mkdir()
+    box((50.5, 20, 10)).export(tmp_path / "gripper" / "finger.stl")
+    box((3, 2, 1)).export(tmp_path / "gripper" / "tip.obj")
+    box((0.093, 0.05, 0.04)).export(tmp_path / "base.stl")
+    listed = objects.library(tmp_path, scale={"*.obj": 0.01, "gripper": 0.001})
+    made, _ = objects.bodies(listed)
+    sides = {
+        item.name: np.ptp(np.asarray(x.vertices), axis=0).max() for item, x in zip(listed.items, made, strict=True)
+    }
+    assert sides == pytest.approx({"gripper/finger.stl": 0.0505, "gripper/tip.obj": 0.03, "base.stl": 0.093}, rel=1e-5)
+    for scale, message in (({"robot": 1.0}, "scale has 'robot', but"), ({"gripper": 0.0}, "scale must be a positive")):
+        with pytest.raises(ValueError, match=message):
+            objects.library(tmp_path, scale=scale)
+
+
 def test_missing_columns_are_named(tmp_path):
     shapenet.build(tmp_path, [], {})
     for missing in (["front", "unit"], ["fullId"]):

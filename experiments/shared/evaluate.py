@@ -19,6 +19,8 @@ MAIN_SUBSETS = (
     *("visual", "tactile", "visual and tactile", "visual and pose", "all inputs", "pose"),
     evaluation.TRUE_STATE,
 )
+# Metrics that are printed at the end, with further metrics of your own.
+PRINTED = ("visual_skill", "tactile_skill", "position_on_pad")
 SEED = 20  # seed of the re-rolls
 
 Judge = Callable[[evaluation.Predicted, dataset.Pairs], evaluation.Scores]
@@ -69,7 +71,7 @@ class SplitPairs(NamedTuple):
 
 
 def evaluate(run: Run, data: dataset.Dataset, own: Extensions = NONE) -> str:
-    """Score every model on held-out trajectories, write the results, and return the main table in Markdown.
+    """Score every model on held-out trajectories, write the results, and return a short text for the terminal.
 
     While the checksums of all inputs and results match those in `manifest.json`, nothing is evaluated again.
     """
@@ -80,7 +82,7 @@ def evaluate(run: Run, data: dataset.Dataset, own: Extensions = NONE) -> str:
     )
     reason = stale(workdir, part, inputs)
     if reason is None:
-        return table.read_text()
+        return _ending(run, storage.read_json(metrics, f"delete {metrics}"), own)
     if metrics.exists() or table.exists():
         say(f"evaluate: again, because {reason}")
     pairs = _pairs(run, data, own)
@@ -112,7 +114,23 @@ def evaluate(run: Run, data: dataset.Dataset, own: Extensions = NONE) -> str:
     storage.write_bytes(complete, full.encode())
     storage.write_json(metrics, {"split": run.split, **summary})
     record(workdir, part, inputs, [metrics, table, complete, *figures])
-    return text
+    return _ending(run, summary, own)
+
+
+def _ending(run: Run, summary: dict, own: Extensions) -> str:
+    """What the terminal shows at the end: a short table, where the results are, and what to do next."""
+    rows = main_rows(TITLES[run.main_model], list(summary["predictors"]))
+    shown = [metric for metric in own.scored if metric.name in PRINTED or metric not in evaluation.METRICS]
+    return "\n".join(
+        [
+            f"{run.workdir.name}: {summary['items']} trajectories of {summary['objects']} objects, held out by "
+            f"{run.split}. Skill is 0 for the mean image and 1 for the true image",
+            evaluation.short_table(summary, rows=rows, metrics=shown),
+            f"tables:  {run.workdir / f'table{run.suffix}.md'} explains the metrics, table-full{run.suffix}.md has all",
+            f"figures: {run.figures}",
+            f'next:    sts.Predictor.load("{run.folder(run.main_model)}") in Python predicts from images',
+        ]
+    )
 
 
 def _inputs(run: Run, data: dataset.Dataset, own: Extensions) -> dict[str, str]:

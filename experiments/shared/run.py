@@ -20,6 +20,8 @@ from sts_jax.training import TrainConfig
 
 Stage = Literal["collect", "train", "evaluate"]
 Preset = TypeVar("Preset")  # type of a configuration
+# Fields of the configuration that have no effect on the training of each kind of models
+WITHOUT_EFFECT = {"statespace": ("training", "steps", "targets"), "paper": ("state_training", "num_samples")}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,14 +40,15 @@ class Args:
     objects: Path | None = None  # folder of mesh files or of ShapeNetSem, whose objects replace the procedural ones
     # classes of the objects. Empty: those of the experiment, or all classes of --objects if it has none of these
     classes: tuple[str, ...] = ()
-    # length of one unit of the files in --objects (m), such as 0.001 for millimetres. None: that of ShapeNetSem's
-    # table, or 1 m
-    scale: float | None = None
+    # length of one unit of the files in --objects (m), such as 0.001 for millimetres, or files and sub-folders, each
+    # followed by its own: --scale gripper 0.001 "*.glb" 1. None: that of ShapeNetSem's table, or 1 m
+    scale: float | dict[str, float] | None = None
     # axis of the files in --objects that points up. None: that of ShapeNetSem's table, or y for glTF and z for other
     # files
     up: Literal["x", "y", "z"] | None = None
     parts: bool = False  # decompose an object into convex parts if its convex hull fits badly
     debug: bool = False  # show the traceback of every error
+    given: tyro.conf.Suppress[frozenset[str]] = frozenset()  # names of the options on the command line
 
 
 def command(presets: Mapping[str, Config], workdir: str, description: str | None) -> None:
@@ -61,11 +64,28 @@ def parse(presets: Mapping[str, Config], workdir: str, description: str | None) 
     preset = chosen_preset(presets, sys.argv[1:])
     default = Args(Path(workdir), preset)
     args = tyro.cli(Args, default=default, description=description, config=(tyro.conf.AvoidSubcommands,))
-    for model, field in (("paper", "training"), ("statespace", "state_training")):
-        if args.config.model != model and getattr(args.config, field) != getattr(preset, field):
-            option = f"--{field.replace('_', '-')}"
-            say(f"note: {option}.* has no effect, because --model {args.config.model} is trained")
-    return args
+    for field in WITHOUT_EFFECT[args.config.model]:
+        value = getattr(args.config, field)
+        if value != getattr(preset, field):
+            option = f"--{field.replace('_', '-')}" + ".*" * dataclasses.is_dataclass(value)
+            say(f"note: {option} has no effect, because --model {args.config.model} is trained")
+    given = options(sys.argv[1:])
+    return dataclasses.replace(args, config=with_epochs(args.config, given), given=given)
+
+
+def options(words: Sequence[str]) -> frozenset[str]:
+    """Names of the options on a command line, such as `collection.num-objects`."""
+    return frozenset(word[2:].partition("=")[0].replace("_", "-") for word in words if word.startswith("--"))
+
+
+def with_epochs(config: Preset, given: frozenset[str]) -> Preset:
+    """Drop the preset's numbers of gradient steps if the command line has the number of epochs or other steps."""
+    if {"training.epochs", "training.steps"} & given and "steps" not in given:
+        config = dataclasses.replace(config, steps=None)  # type: ignore[type-var]
+    if "state-training.epochs" in given and "state-training.steps" not in given:
+        state = dataclasses.replace(config.state_training, steps=None)  # type: ignore[attr-defined]
+        config = dataclasses.replace(config, state_training=state)  # type: ignore[type-var]
+    return config
 
 
 def chosen_preset(presets: Mapping[str, Preset], words: Sequence[str]) -> Preset:
@@ -93,9 +113,18 @@ def configure(args: Args) -> Config:
 
 
 def with_meshes(collection: dataset.Collection, folder: Path, args: Args) -> dataset.Collection:
-    """Replace the objects of a collection by those of a folder, with about the same number of trajectories in total."""
-    classes = sts.objects.library(folder).classes
-    taken = args.classes or tuple(name for name in classes if name in collection.categories) or classes
+    """Replace the objects of a collection by those of a folder, with about the same number of trajectories in total.
+
+    Options for the number of trajectories and for the classes that are on the command line are left as they are.
+    """
+
+    def spread(name: str, number: int) -> int:
+        given = f"collection.{name}" in args.given
+        return number if given else max(number, round(collection.num_objects * number / count))
+
+    classes = sts.objects.library(folder, scale=args.scale).classes
+    asked = args.classes or (collection.categories if "collection.categories" in args.given else ())
+    taken = asked or tuple(name for name in classes if name in collection.categories) or classes
     path = args.workdir / "objects.txt"
     with storage.lock(args.workdir):  # so that another run in this folder does not lose its listing
         meshes, listing = dataset.survey_meshes(
@@ -114,18 +143,22 @@ def with_meshes(collection: dataset.Collection, folder: Path, args: Args) -> dat
         if not path.exists() or path.read_bytes() != listing.encode():
             storage.write_bytes(path, listing.encode())
     count = len(meshes.names)
-    say(f"{count} objects of the classes {', '.join(taken)} can be used. {path} lists these and the objects left out")
-    each, rendered = (
-        max(number, round(collection.num_objects * number / count))
-        for number in (collection.num_per_object, collection.rendered_per_object)
-    )
-    return dataclasses.replace(
+    say(f"objects of the classes {', '.join(taken)}: {path} lists {count} that can be used and those left out")
+    each, rendered = spread("num-per-object", collection.num_per_object), None
+    if collection.num_rendered is not None:
+        rendered = spread("num-rendered", collection.num_rendered)
+        if "collection.num-rendered" not in args.given:
+            rendered = min(rendered, each)
+    collection = dataclasses.replace(
         collection,
         meshes=meshes,
-        num_objects=count,
+        num_objects=collection.num_objects if "collection.num-objects" in args.given else count,
         num_per_object=each,
-        num_rendered=None if collection.num_rendered is None else rendered,
+        num_rendered=rendered,
     )
+    sizes = ", ".join(f"{name} {len(part)}" for name, part in dataset.split_objects(collection).items())
+    say(f"{count} objects with {each} trajectories each, split into {sizes}")
+    return collection
 
 
 def main(config: Config, workdir: Path, *, only: Stage | None = None, own: Extensions = NONE) -> None:

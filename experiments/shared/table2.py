@@ -179,7 +179,7 @@ def augmented(config: Config, images: np.ndarray, empty: np.ndarray) -> np.ndarr
 
 
 def evaluate(config: Config, data: Recorded, workdir: Path, folder: Path) -> str:
-    """Score the models on the validation trajectories, write the results to a folder, and return the table."""
+    """Score the models on the validation trajectories, write the results, and return a short text for the terminal."""
     metrics, table = folder / "metrics.json", folder / "table.md"
     models = {name: folder / "models" / name for name in NAMES}
     inputs = {"config.json": storage.digest(dataclasses.asdict(config)), "dataset": data.identity}
@@ -187,7 +187,7 @@ def evaluate(config: Config, data: Recorded, workdir: Path, folder: Path) -> str
     inputs |= {f"models/{name}": identity(path) for name, path in judged.items()}
     reason = stale(folder, "evaluation", inputs)
     if reason is None:
-        return table.read_text()
+        return ending(data, storage.read_json(metrics, f"delete {metrics}"), folder)
     if metrics.exists():
         say(f"evaluate: again, because {reason}")
     predicted = predictions(models, data)
@@ -204,7 +204,26 @@ def evaluate(config: Config, data: Recorded, workdir: Path, folder: Path) -> str
     storage.write_bytes(table, text.encode())
     storage.write_json(metrics, {"source": data.source, **summary})
     record(folder, "evaluation", inputs, [metrics, table, *figures])
-    return text
+    return ending(data, summary, folder)
+
+
+def ending(data: Recorded, summary: Mapping[str, Any], folder: Path) -> str:
+    """What the terminal shows at the end: a short table, where the results are, and what to do next."""
+    scores = [summary[stream]["predictors"] for stream in evaluation.STREAMS]
+    rows = [["predictor", *(f"{stream} skill" for stream in evaluation.STREAMS)]]
+    for name in dict.fromkeys(name for stream in scores for name in stream):
+        cells = [(stream.get(name) or {}).get("skill") for stream in scores]
+        rows.append([name, *("-" if cell is None else f"{cell['value']:.3f}" for cell in cells)])
+    return "\n".join(
+        [
+            f"{len(data.validation.number)} held-out trajectories of {data.source}. "
+            "Skill is 0 for the mean image and 1 for the true image",
+            evaluation.aligned(rows),
+            f"table:   {folder / 'table.md'} has intervals and explains the metrics",
+            f"figures: {folder / 'figures'}",
+            f'next:    sts.Predictor.load("{folder / "models" / "mvae-without-pose"}") in Python predicts from images',
+        ]
+    )
 
 
 def predictions(models: Mapping[str, Path], data: Recorded) -> dict[str, Predicted]:

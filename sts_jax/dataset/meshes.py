@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import hashlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Literal
 
 import numpy as np
@@ -24,7 +24,8 @@ class Meshes:
     labels: tuple[str, ...]  # class of each object
     digest: str  # SHA-256 of the names and contents of the files
     cache: str | None = None  # folder that keeps the processed objects (None: they are not kept)
-    scale: float | None = None  # length of one unit of the files (m), None as in `survey_meshes`
+    # length of one unit of the files (m), or pairs of the names of some and the length, None as in `survey_meshes`
+    scale: float | tuple[tuple[str, float], ...] | None = None
     up: Literal["x", "y", "z"] | None = None  # axis of the files that becomes +z, None as in `survey_meshes`
 
 
@@ -33,7 +34,7 @@ def survey_meshes(
     scenario: physics.Scenario,
     *,
     classes: tuple[str, ...] = (),
-    scale: float | None = None,
+    scale: float | Mapping[str, float] | None = None,
     up: Literal["x", "y", "z"] | None = None,
     parts: bool = False,
     cache: str | os.PathLike[str] | None = None,
@@ -48,7 +49,8 @@ def survey_meshes(
         folder: A folder as in `objects.library`.
         scenario: The scenario in which the objects are simulated.
         classes: The classes to use, a subset of `objects.library(folder).classes`. Empty means all.
-        scale: Length of one unit of the files (m). Default: the value in ShapeNetSem's table, or 1 m for other files.
+        scale: Length of one unit of the files (m), or a mapping from files to lengths as in `objects.library`. Default:
+            the value in ShapeNetSem's table, or 1 m for other files.
         up: The files' axis that becomes +z. Default: the axis in ShapeNetSem's table, y for glTF, z for other files.
         parts: See `Collection.parts`.
         cache: Folder that keeps the processed objects for later calls.
@@ -84,7 +86,8 @@ def survey_meshes(
         raise ValueError(f"{folder} has no object that can be used in {type(scenario).__name__}:\n{listing}")
     names, labels = tuple(item.name for item in usable), tuple(item.label for item in usable)
     kept = None if cache is None else str(cache)
-    return Meshes(str(folder), names, labels, digest.hexdigest(), kept, scale, up), listing
+    stated = tuple(scale.items()) if isinstance(scale, Mapping) else scale
+    return Meshes(str(folder), names, labels, digest.hexdigest(), kept, stated, up), listing
 
 
 def _triangles(body: objects.Body) -> np.ndarray:
@@ -106,5 +109,6 @@ def _same(one: np.ndarray, other: np.ndarray) -> bool:
 @functools.lru_cache
 def open_library(meshes: Meshes, parts: bool) -> tuple[objects.Library, dict[str, int]]:
     """Library of all mesh files in `meshes.folder`, and the index of each object in its items, by name."""
-    library = objects.library(meshes.folder, cache=meshes.cache, scale=meshes.scale, up=meshes.up, parts=parts)
+    scale = dict(meshes.scale) if isinstance(meshes.scale, tuple) else meshes.scale
+    library = objects.library(meshes.folder, cache=meshes.cache, scale=scale, up=meshes.up, parts=parts)
     return library, {item.name: index for index, item in enumerate(library.items)}

@@ -31,10 +31,12 @@ from sts_jax.evaluation.references import baselines as baselines
 from sts_jax.evaluation.references import ceiling as ceiling
 from sts_jax.evaluation.references import image_baselines as image_baselines
 from sts_jax.evaluation.results import STREAMS as STREAMS
+from sts_jax.evaluation.results import aligned as aligned
 from sts_jax.evaluation.results import full_table as full_table
 from sts_jax.evaluation.results import gain as gain
 from sts_jax.evaluation.results import image_summary as image_summary
 from sts_jax.evaluation.results import score as score
 from sts_jax.evaluation.results import scorer as scorer
+from sts_jax.evaluation.results import short_table as short_table
 from sts_jax.evaluation.results import summarise as summarise
 from sts_jax.evaluation.results import table as table

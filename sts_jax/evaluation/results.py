@@ -321,6 +321,20 @@ def full_table(summary: dict, *, title: str, notes: Sequence[str] = (), metrics:
     return _page(summary, title, metrics, lines, notes)
 
 
+def short_table(summary: dict, *, metrics: Sequence[Metric], rows: Sequence[str] | None = None) -> str:
+    """Format metrics without intervals in aligned columns for a terminal, with the arguments of `table`."""
+    lines = [["predictor", *(metric.title for metric in metrics)]]
+    for name in summary["predictors"] if rows is None else rows:
+        lines.append([name, *(_shown(summary["predictors"][name], metric, interval=False) for metric in metrics)])
+    return aligned(lines)
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> str:
+    """Format the rows of a table in aligned columns for a terminal."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join("  ".join(map(str.ljust, row, widths)).rstrip() for row in rows)
+
+
 def _head(cells: Sequence[str]) -> list[str]:
     return [_row(cells), "|---" * len(cells) + "|"]
 

@@ -56,6 +56,7 @@ class Entry:
     # Largest distances (m) of the surface outside the collision parts, and of the collision parts outside the surface.
     gaps: tuple[float, float]
     notes: tuple[str, ...]  # Repairs of the mesh and remarks on the item.
+    length: float  # Longest side before a larger object was scaled down (m).
 
 
 def cache_path(library: Library, item: Item) -> Path:
@@ -78,7 +79,7 @@ def cache_path(library: Library, item: Item) -> Path:
 
 def write_cached(path: Path, entry: Entry) -> None:
     """Write the body of an item to a file of the cache, atomically."""
-    about = json.dumps({"gaps": entry.gaps, "notes": entry.notes})
+    about = json.dumps({"gaps": entry.gaps, "notes": entry.notes, "length": entry.length})
     leaves: dict[str, Any] = {field.name: getattr(entry.body, field.name) for field in dataclasses.fields(Body)}
     write_arrays(path, {"about": np.frombuffer(about.encode(), np.uint8), **leaves})
 
@@ -89,6 +90,6 @@ def read_cached(path: Path, item: Item) -> Entry | None:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
             body = Body(**{field.name: jnp.asarray(data[field.name]) for field in dataclasses.fields(Body)})
             about = json.loads(data["about"].tobytes())
-        return Entry(item, body, tuple(about["gaps"]), tuple(about["notes"]))
+        return Entry(item, body, tuple(about["gaps"]), tuple(about["notes"]), float(about["length"]))
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None

@@ -7,7 +7,8 @@ import dataclasses
 import os
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Literal
 
@@ -18,7 +19,7 @@ from scipy.spatial import ConvexHull
 from sts_jax._checked import checked
 from sts_jax.objects import shapenet
 from sts_jax.objects.assembly import STEEL, WALL
-from sts_jax.objects.body import CATEGORIES, Body
+from sts_jax.objects.body import CATEGORIES, PAD, Body
 from sts_jax.objects.checks import check_positive
 from sts_jax.objects.items import (
     LARGEST,
@@ -30,10 +31,11 @@ from sts_jax.objects.items import (
     read_cached,
     write_cached,
 )
-from sts_jax.objects.meshes import AXES, load
+from sts_jax.objects.meshes import AXES, ScaledDown, load
 from sts_jax.objects.parts import decompose, gaps
 
 THINNEST = 0.0005  # m, an object thinner than this is refused, because its contacts are unstable
+ROOM = 3.0  # m, a file without a stated unit that is longer than this is not in metres
 HOLLOW = 0.002  # m, a hull that reaches farther outside the surface than this is worth decomposing
 
 _SOLID = ("scissors", "fork", "spoon")  # classes of solid steel objects
@@ -48,7 +50,7 @@ def library(
     folder: str | os.PathLike[str],
     *,
     cache: str | os.PathLike[str] | None = None,
-    scale: float | None = None,
+    scale: float | Mapping[str, float] | None = None,
     up: Literal["x", "y", "z"] | None = None,
     parts: bool = False,
 ) -> Library:
@@ -65,7 +67,10 @@ def library(
     Args:
         folder: Folder of the objects.
         cache: Folder for the loaded bodies, which is created if it is missing. None loads the mesh files each time.
-        scale: Length of one unit of the files (m). None uses ShapeNetSem's table, or 1 m without a table.
+        scale: Length of one unit of the files (m), or a mapping from names of files or sub-folders to lengths, such as
+            `{"gripper": 0.001, "*.glb": 1.0}`, of which the first that fits a file counts. None, or no fitting name,
+            uses ShapeNetSem's table, or 1 m without a table. Loading then stops with an error if a file is longer than
+            3 m, or if one is longer than 1 m and another would fit on the pad: not all can be in metres.
         up: Axis of the files that becomes +z. None uses ShapeNetSem's table. Without a table, None is "y" for glTF and
             "z" for other formats.
         parts: If True, objects whose convex hull reaches more than 2 mm outside the surface are decomposed into convex
@@ -74,7 +79,9 @@ def library(
     folder = Path(folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder of objects: check the path")
-    check_positive("scale", scale, "metres per unit of the files")
+    scales = dict(scale) if isinstance(scale, Mapping) else {} if scale is None else {"*": scale}
+    for length in scales.values():
+        check_positive("scale", length, "metres per unit of the files")
     root = shapenet.find_root(folder)
     items, skipped = _walked(folder) if root is None else shapenet.items(root)
     if not items:
@@ -83,8 +90,13 @@ def library(
             f"{folder}: the folder contains no usable mesh (number of skipped files: {len(skipped)}): give a folder "
             f"with mesh files that `objects.load` can read{reasons}"
         )
-    if scale is not None:
-        items = [dataclasses.replace(item, scale=scale) for item in items]
+    for pattern, length in reversed(scales.items()):  # the first that fits is applied last
+        fits = [fnmatchcase(item.name, pattern) or fnmatchcase(item.name, f"{pattern}/*") for item in items]
+        if not any(fits):
+            raise ValueError(f"scale has {pattern!r}, but {folder} has no such file or sub-folder: check the name")
+        items = [
+            dataclasses.replace(item, scale=length) if fit else item for item, fit in zip(items, fits, strict=True)
+        ]
     if up is not None:
         items = [dataclasses.replace(item, up=AXES[up][0], front=AXES[up][1]) for item in items]
     items.sort(key=lambda item: (item.label, item.name))
@@ -128,6 +140,12 @@ def read(collection: Library, index: int) -> Entry:
 
     Scissors, forks and spoons are solid and of steel. All other objects are shells with contents.
     """
+    entry = _read(collection, index)
+    _check_metres(collection, [(entry.length, entry.item)] * 2)
+    return entry
+
+
+def _read(collection: Library, index: int) -> Entry:
     item = collection.items[index]
     if collection.cache is None:
         return _load(collection, item)
@@ -142,8 +160,7 @@ def read(collection: Library, index: int) -> Entry:
 def bodies(collection: Library, indices: Iterable[int] | None = None) -> tuple[list[Body], list[tuple[str, str]]]:
     """Load the items with these indices, or all items: the bodies, and (name, reason) of each that cannot be loaded."""
     loaded, skipped = [], []
-    for index in range(len(collection.items)) if indices is None else indices:
-        entry = _read_or_reason(collection, index)
+    for index, entry in _entries(collection, range(len(collection.items)) if indices is None else indices):
         if isinstance(entry, str):
             skipped.append((collection.items[index].name, entry))
         else:
@@ -158,8 +175,8 @@ def survey(collection: Library, *, progress: Callable[[str], None] | None = None
         The library, with the items that cannot be loaded moved to `skipped`, and a listing of all items.
     """
     items, skipped, lines = [], list(collection.skipped), []
-    for index, item in enumerate(collection.items):
-        entry = _read_or_reason(collection, index)
+    for index, entry in _entries(collection, range(len(collection.items))):
+        item = collection.items[index]
         if isinstance(entry, str):
             skipped.append((item.name, entry))
             line = f"{item.label}  {item.name}: left out: {entry}"
@@ -197,11 +214,35 @@ def facts(body: Body, apart: tuple[float, float]) -> list[str]:
     return [size, f"{drawn} faces", hull, " / ".join(f"{gap * 1e3:.2f}" for gap in apart)]
 
 
+def _entries(collection: Library, indices: Iterable[int]) -> Iterator[tuple[int, Entry | str]]:
+    """Read items, or the reasons why they cannot be loaded. Stops with an error if the files have different units."""
+    span: list[tuple[float, Item]] = []  # the shortest and the longest file whose unit is not stated
+    for index in indices:
+        entry = _read_or_reason(collection, index)
+        if isinstance(entry, Entry) and entry.item.scale is None:
+            both = [*span, (entry.length, entry.item)]
+            span = [pick(both, key=lambda one: one[0]) for pick in (min, max)]
+            _check_metres(collection, span)
+        yield index, entry
+
+
+def _check_metres(collection: Library, span: list[tuple[float, Item]]) -> None:
+    """Raise an error if the shortest and the longest of some files without a stated unit cannot both be in metres."""
+    (low, short), (high, long) = span
+    if long.scale is None and (high > ROOM or (high > 1 and low <= PAD)):
+        other = "" if short == long else f" and {short.name} {low:.3g} m"
+        raise ValueError(
+            f"{collection.folder}: in metres, {long.name} would be {high:.3g} m long{other}. Give `scale`, the length "
+            f"of a unit (m), such as --scale 0.001 for millimetres, --scale '{long.name}' 0.001 for some files or "
+            "sub-folders, or --scale 1 if all are in metres"
+        )
+
+
 def _read_or_reason(collection: Library, index: int) -> Entry | str:
     """Read an item, or return the reason why it cannot be loaded."""
     item = collection.items[index]
     try:
-        return read(collection, index)
+        return _read(collection, index)
     except ImportError:
         raise  # a missing package is no fault of the object
     except Exception as error:  # the mesh libraries raise errors of many types for a damaged file
@@ -232,6 +273,8 @@ def _load(collection: Library, item: Item) -> Entry:
         )
     notes = [_short(warning.message, item) for warning in caught]
     vertices = np.asarray(body.vertices, float)
+    length = float(np.ptp(vertices, axis=0).max())
+    length = max([length, *(one.message.length for one in caught if isinstance(one.message, ScaledDown))])
     shape = ConvexHull(np.asarray(body.hulls[0], float))
     thickness = float(np.ptp(vertices @ shape.equations[:, :3].T, axis=0).min())
     if thickness < THINNEST:
@@ -246,4 +289,4 @@ def _load(collection: Library, item: Item) -> Entry:
             apart = gaps(body)
         except ValueError as error:
             notes.append(str(error))
-    return Entry(item, body, apart, (*item.notes, *notes))
+    return Entry(item, body, apart, (*item.notes, *notes), length)

@@ -31,6 +31,12 @@ AXES = {
 }
 
 
+class ScaledDown(UserWarning):
+    """A mesh was scaled down, because it is longer than the argument `largest` of `load`."""
+
+    length: float  # longest side before (m)
+
+
 def rotation(up: Sequence[float], front: Sequence[float]) -> Float[np.ndarray, "3 3"]:
     """Rotation matrix that turns a file's up direction to +z and its front direction to -y.
 
@@ -163,7 +169,9 @@ def _factor(
             "the unit of the file, and give longest_side (in metres), or give scale (in metres per unit)"
         )
     if largest is not None and extent > largest:
-        warnings.warn(f"{path}: the longest side of {extent:.3g} m is scaled down to {largest} m", stacklevel=3)
+        note = ScaledDown(f"{path}: the longest side of {extent:.3g} m is scaled down to {largest} m")
+        note.length = extent
+        warnings.warn(note, stacklevel=3)
         return factor * largest / extent
     if extent > PAD:
         raise ValueError(
