@@ -12,7 +12,9 @@ import numpy as np
 POSITIVE = {"above": 0.0}
 NOT_NEGATIVE = {"at_least": 0.0}
 SHARE = {"at_least": 0.0, "at_most": 1.0}
-COUNT = {"at_least": 1, "whole": True}
+NUMBER = {"at_least": 0, "at_most": 2**32 - 1, "whole": True}
+COUNT = {"at_least": 1, "at_most": 10**9, "whole": True}
+MOST_PIXELS = 8192  # height or width of an image
 STATIC = {"static": True}  # JAX compiles a program for each value of the field
 
 _SMALLEST = float(np.finfo(np.float32).tiny)  # float32 arithmetic flushes smaller numbers to 0
@@ -32,20 +34,20 @@ def limits(metadata: Mapping[str, Any], array: Any) -> list[tuple[Any, str]]:
     if "below" in metadata:
         conditions.append(((array < metadata["below"]).all(), f"it must be < {metadata['below']:.4f}"))
     if "at_most" in metadata:
-        conditions.append(((array <= metadata["at_most"]).all(), f"it must be <= {metadata['at_most']:g}"))
+        conditions.append(((array <= metadata["at_most"]).all(), f"it must be <= {metadata['at_most']:,.10g}"))
     return conditions
 
 
-def check(config: Any) -> None:
+def check(config: Any, owner: str = "") -> None:
     """Raise a ValueError for the first number of a dataclass that is not finite, not whole or out of its range."""
     for field in dataclasses.fields(config):
         value, metadata = getattr(config, field.name), field.metadata
         if not metadata or value is None:
             continue
         if metadata.get("whole") and not isinstance(value, int | np.integer):
-            raise ValueError(f"{field.name} must be a whole number, got {value!r}")
-        if not np.isfinite(value):
-            raise ValueError(f"{field.name} must be finite, got {value!r}")
+            raise ValueError(f"{owner}{field.name} must be a whole number, got {value!r}")
+        if not -np.inf < value < np.inf:
+            raise ValueError(f"{owner}{field.name} must be finite, got {value!r}")
         for holds, words in limits(metadata, np.asarray(value)):
             if not holds:
-                raise ValueError(f"{field.name} {words.removeprefix('it ')}, got {value!r}")
+                raise ValueError(f"{owner}{field.name} {words.removeprefix('it ')}, got {value!r}")

@@ -9,6 +9,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Real
 
 from sts_jax import optics
 from sts_jax._checked import checked
+from sts_jax._ranges import MOST_PIXELS
 from sts_jax.objects.body import FACE_CLASSES, Body, is_traced
 from sts_jax.rendering import drawing, equilibrium
 from sts_jax.sensor import Sensor
@@ -86,8 +87,8 @@ def sense(
         raise TypeError(f"body is a {type(body).__name__}: for several bodies use objects.stack and jax.vmap")
     if isinstance(pose, tuple):
         raise TypeError(f"pose is a {type(pose).__name__}: unpack it with *, as in sense(sensor, body, *placement)")
-    if min(resolution) < 1:
-        raise ValueError(f"resolution (height, width) must be > 0, got {resolution}")
+    if not all(1 <= side <= MOST_PIXELS for side in resolution):
+        raise ValueError(f"resolution (height, width) must be from 1 to {MOST_PIXELS:,} pixels, got {resolution}")
     if body.vertices.ndim != 2 or not is_traced(body):
         body.check()
     if len(body.faces) > FACE_CLASSES[-1]:

@@ -30,7 +30,8 @@ IMPRINT = np.zeros((4, 5), np.float32)
 THIN = with_field(SENSOR, "camera.distance", 0.004)
 # A call, the type of its error, and a part of the message.
 BAD_CALLS = [
-    (lambda: sense(SENSOR, BODY, POSE, resolution=(0, 64)), ValueError, r"resolution .* must be > 0, got \(0, 64\)"),
+    (lambda: sense(SENSOR, BODY, POSE, resolution=(0, 64)), ValueError, r"resolution .* from 1 to 8,192 .* \(0, 64\)"),
+    (lambda: sense(SENSOR, BODY, POSE, resolution=(10**6, 9)), ValueError, r"resolution .* to 8,192 .* \(1000000, 9\)"),
     (lambda: sense(SENSOR, BODY, POSE[None]), TypeError, "parameter 'pose'"),
     (
         lambda: sense(SENSOR, BODY, sts.physics.rest.Placement(POSE, WRENCH)),

@@ -37,6 +37,9 @@ ARGUMENTS = [
     ({"scenario": "freefall"}, r"scenario is 'freefall', but it must be Freefall\(\)"),
     ({"key": 0}, r"key is 0, but it must be a JAX key, such as jax\.random\.key\(0\)"),
     ({"num": 0}, "num is 0, but it must be a whole number"),
+    ({"num": 10**10}, "num is 10000000000, .* from 1 to 100,000,000"),
+    ({"num": 10**7}, r"num is 10000000, which gives 600,000,000 frames .* GB: call it several times"),
+    ({"chunk": 10**10}, "chunk is 10000000000, .* from 1 to 100,000,000"),
     ({"progress": "bar"}, "progress is 'bar', but it must be True, False or a function"),
     ({"engine": "bullet"}, "engine is 'bullet', but it must be 'mjx' or 'mujoco'"),
     (second(shell_mass=jnp.float32(-0.1)), "body 1: shell_mass is -0.1"),
@@ -53,6 +56,26 @@ FIELDS = [
     (changed(Inclined(), slope=30.0), r"scenario\.slope is 30.0 rad, .* use math\.radians"),
     (changed(Released(), beyond=(-10.0, 10.0)), r"scenario\.beyond .* use math\.radians"),
 ]
+CONTACTS = [
+    (changed(Freefall(), frames=10**9), r"scenario\.frames is 1000000000 with 32 time steps .* from 1 to 312,500"),
+    (changed(Inclined(), tries=10**10), r"scenario\.tries is 10000000000, but it must be from 1 to 10,000"),
+]
+for name, values in {
+    "timestep": (NAN, 0.0, -0.001),
+    "time_constant": (NAN, 0.0, np.inf),
+    "damping_ratio": (NAN, -np.inf, 0.0),
+    "soft": (NAN, 0.0, 1.0),
+    "hard": (-0.1, 1.5),
+    "width": (NAN, 0.0, -1.0),
+    "torsional": (NAN, -0.1),
+    "rolling": (np.inf, -0.1),
+    "impratio": (NAN, 0.0, -1.0),
+    "iterations": (0, 10**12),
+    "ls_iterations": (0, -1),
+}.items():
+    for value in values:
+        contact = dataclasses.replace(Freefall().contact, **{name: value})
+        CONTACTS.append((changed(Freefall(), contact=contact), rf"scenario\.contact\.{name} must be .*, got {value}"))
 GIVEN = [
     ({"start": START._replace(pose=np.zeros((2, 7)))}, r"start\.pose has quaternions whose length is not 1"),
     ({"start": START._replace(condition=np.zeros((2, 1)))}, r"start\.condition has shape \(2, 1\), .* \(2, 0\)"),
@@ -62,7 +85,7 @@ GIVEN = [
 ]
 
 
-@pytest.mark.parametrize(("change", "message"), [*ARGUMENTS, *FIELDS, *GIVEN])
+@pytest.mark.parametrize(("change", "message"), [*ARGUMENTS, *FIELDS, *CONTACTS, *GIVEN])
 def test_what_simulate_refuses_is_named(change, message):
     with pytest.raises((TypeError, ValueError), match=message):
         inspect.unwrap(physics.simulate)(**GOOD | change)

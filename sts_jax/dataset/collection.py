@@ -8,12 +8,12 @@ import jax
 import numpy as np
 
 from sts_jax import objects, physics
-from sts_jax._ranges import COUNT, NOT_NEGATIVE
+from sts_jax._ranges import COUNT, MOST_PIXELS, NUMBER
 from sts_jax._ranges import check as check_ranges
 from sts_jax.dataset import records
 from sts_jax.dataset.meshes import Meshes, open_library
 
-_NUMBER = NOT_NEGATIVE | {"whole": True}  # 0 or a larger whole number
+_MANY = COUNT | {"at_most": 10**6}
 PARTS = ("train", "validation", "test")  # the parts into which the objects are split
 LEAST = 3  # number of objects in the smallest part of a split of nine or more objects
 
@@ -32,21 +32,21 @@ class Collection:
     meshes: Meshes | None = None
     # split an object into convex parts if its hull fits badly (needs the package coacd, about ten seconds per object)
     parts: bool = False
-    num_objects: int = field(default=160, metadata=COUNT)  # number of objects
+    num_objects: int = field(default=160, metadata=_MANY)  # number of objects
     # trajectories per object, each with newly drawn hidden values such as mass and friction
-    num_per_object: int = field(default=4, metadata=COUNT)
+    num_per_object: int = field(default=4, metadata=_MANY)
     # number of trajectories with images of all frames (the others: of the first and last frame)
-    num_full: int = field(default=20, metadata=_NUMBER)
+    num_full: int = field(default=20, metadata=NUMBER)
     # number of trajectories with images, for each object: the first ones (None: all)
     num_rendered: int | None = field(default=None, metadata=COUNT)
     # additional visual images per object, in initial poses that are not simulated
-    num_views: int = field(default=0, metadata=_NUMBER)
+    num_views: int = field(default=0, metadata=NUMBER | {"at_most": 10**6})
     resolution: tuple[int, int] = (64, 64)  # height and width of the images (pixels)
     crop: bool = False  # images show the square around the object, as in the paper, instead of the whole pad
     shares: tuple[float, float, float] = (0.7, 0.1, 0.2)  # shares of objects for training, validation and test (sum 1)
     # number of objects in one shard, which is written as a whole or not at all
     objects_per_shard: int = field(default=40, metadata=COUNT)
-    seed: int = field(default=0, metadata=_NUMBER)  # seed of the objects, the trajectories and the split
+    seed: int = field(default=0, metadata=NUMBER)  # seed of the objects, the trajectories and the split
     engine: physics.Engine = "mujoco"  # physics engine, see `physics.simulate` (trajectories differ between engines)
 
     @property
@@ -79,8 +79,11 @@ class Collection:
             raise ValueError("categories is empty, but it must name at least one class, such as 'bottle'")
         for category in self.categories if self.meshes is None else ():
             objects.find_family(category)
-        if len(self.resolution) != 2 or not all(type(side) is int and side >= 1 for side in self.resolution):
-            raise ValueError(f"resolution must be two whole numbers of pixels (height, width), got {self.resolution!r}")
+        if len(self.resolution) != 2 or not all(type(n) is int and 1 <= n <= MOST_PIXELS for n in self.resolution):
+            raise ValueError(
+                f"resolution must be two whole numbers (height, width) from 1 to {MOST_PIXELS:,} pixels, got "
+                f"{self.resolution!r}"
+            )
         if self.rendered_per_object > self.num_per_object:
             raise ValueError(f"num_rendered must be <= num_per_object={self.num_per_object}, got {self.num_rendered}")
 

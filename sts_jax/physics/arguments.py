@@ -17,12 +17,15 @@ def listed(body: Any) -> list[Any]:
     return list(body) if isinstance(body, Sequence) and not isinstance(body, str) else [body]
 
 
+MOST_RECORDS = 10**8  # frames of all trajectories of one call: about 10 GB
+
+
 def check_arguments(bodies: Sequence[Any], sensor: Any, scenario: Any, **counts: Any) -> None:
     """Raise an error if an argument cannot be used. `counts`, such as `num=num`, must be whole numbers >= 1."""
     for name, count in counts.items():
         whole = isinstance(count, int | np.integer) and not isinstance(count, bool)
-        if not whole or count < 1:
-            raise ValueError(f"{name} is {count!r}, but it must be a whole number >= 1")
+        if not whole or not 1 <= count <= MOST_RECORDS:
+            raise ValueError(f"{name} is {count!r}, but it must be a whole number from 1 to {MOST_RECORDS:,}")
     if not bodies:
         raise ValueError("no body was given: pass one Body or a sequence of bodies")
     if not isinstance(sensor, Sensor):
@@ -34,6 +37,12 @@ def check_arguments(bodies: Sequence[Any], sensor: Any, scenario: Any, **counts:
             "dataclass that derives from physics.Scenario"
         )
     scenario.check()
+    records = len(bodies) * counts["num"] * scenario.frames
+    if records > MOST_RECORDS:
+        raise ValueError(
+            f"num is {counts['num']}, which gives {records:,} frames of {len(bodies)} bodies, about {records / 1e7:,.0f} "
+            f"GB: call it several times with at most {MOST_RECORDS:,} frames and other keys"
+        )
     check_bodies(bodies)
 
 

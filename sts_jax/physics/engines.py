@@ -94,8 +94,9 @@ def drawn_fields(
     model = copy.copy(original)
     data = mujoco.MjData(model)
     rigid = rigids(bodies, which, hidden)
-    fields = []
+    fields, limited = [], [constants.limited(np.asarray(body.hulls)) for body in bodies]
     for row, body in enumerate(which.tolist()):
+        model.geom_friction[model.geom_bodyid > 0, 1:] = limited[body].torsional, limited[body].rolling
         _set_rigid(model, data, body, rigid, row)
         fields.append(scene.drawn(model, like))
     return {name: np.stack([f[name] for f in fields]) for name in fields[0]}

@@ -77,8 +77,8 @@ class Inclined(Scenario):
         check_range("gap", self.gap, positive=False)
         if not (math.isfinite(sum(self.along)) and self.along[0] <= self.along[1]):
             raise ValueError(f"scenario.along is {self.along}, but it must be finite (low, high) with low <= high")
-        if self.tries < 1:
-            raise ValueError(f"scenario.tries is {self.tries}, but it must be >= 1")
+        if not 1 <= self.tries <= 10_000:
+            raise ValueError(f"scenario.tries is {self.tries}, but it must be from 1 to 10,000")
         if not 0 <= self.resting <= 1:
             raise ValueError(f"scenario.resting is {self.resting}, but it must be from 0 to 1")
 

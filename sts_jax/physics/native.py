@@ -6,7 +6,8 @@ only four contacts of a mesh that stands on a face, and a round base would act l
 collides, because the rims of the pad and the wall touch the hull between its vertices.
 """
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -23,7 +24,7 @@ from sts_jax.physics.scenario import Start
 POINT = 1e-6  # m, radius of the contact sphere at each vertex
 MESH_GAP = 0.0001  # m, the mesh pushes where it is deeper than this, which is more than the depth of vertices at rest
 BLOCK = 8  # frames in a row, after which worlds that have ended are no longer simulated
-# An object slower than STILL_SPEED and STILL_TURN for STILL_TIME under constant gravity is assumed to stay at rest.
+# An object in contact that was slower than these for STILL_TIME under constant gravity is assumed to stay at rest.
 STILL_SPEED = 0.001  # m/s
 STILL_TURN = 0.02  # rad/s
 STILL_TIME = 0.5  # s
@@ -58,7 +59,7 @@ class _Counts(NamedTuple):
 
     gone: Bool[np.ndarray, "n"]
     slow: Int[np.ndarray, "n"]
-    still: Int[np.ndarray, "n"]  # consecutive steps slower than STILL_SPEED and STILL_TURN
+    still: Int[np.ndarray, "n"]  # as `slow`, but slower than STILL_SPEED and STILL_TURN
     apart: Int[np.ndarray, "n"]
     touches: Int[np.ndarray, "n"]
     sunk: Float[np.ndarray, "n"]
@@ -75,6 +76,19 @@ class _Steps(NamedTuple):
     @property
     def moving(self) -> Bool[np.ndarray, "n t"]:
         return np.arange(self.qpos.shape[1]) <= self.gone[:, None]
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Keep MuJoCo's warnings, which `Ends.finite` reports, from standard error and from a file MUJOCO_LOG.TXT."""
+    before, silent = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
+    silent.logto_console = silent.logto_file = False
+    silent.set()
+    try:
+        yield
+    finally:
+        if before.logto_console or before.logto_file:  # else another thread restores it
+            before.set()
 
 
 def compile_body(
@@ -114,12 +128,13 @@ def _count(steps: _Steps, counts: _Counts, timestep: float) -> _Counts:
     touched = (np.any(sensors[..., _PAD], axis=-1) | np.any(sensors[..., _WALL], axis=-1)) & moving
     apart = _run(counts.apart, ~touched)
     before = np.concatenate([counts.apart[:, None], apart[:, :-1]], axis=1)
-    begun = touched & (before >= round(PARTED_TIME / timestep))
+    parted = round(PARTED_TIME / timestep)
+    begun, near = touched & (before >= parted), apart < parted
     deepest = np.where((sensors[..., _DEEPEST][..., 0] > 0) & moving, -sensors[..., _DEEPEST][..., 1], 0)
     return _Counts(
         gone=counts.gone | (steps.gone < speed.shape[1]),
-        slow=_run(counts.slow, (speed < SLOW_SPEED) & (turn < SLOW_TURN))[:, -1],
-        still=_run(counts.still, (speed < STILL_SPEED) & (turn < STILL_TURN))[:, -1],
+        slow=_run(counts.slow, near & (speed < SLOW_SPEED) & (turn < SLOW_TURN))[:, -1],
+        still=_run(counts.still, near & (speed < STILL_SPEED) & (turn < STILL_TURN))[:, -1],
         apart=apart[:, -1],
         touches=counts.touches + begun.sum(axis=1),
         sunk=np.maximum(counts.sunk, deepest.max(axis=1)),

@@ -88,8 +88,8 @@ class Released(Scenario):
         check_range("carried", self.carried)
         if self.carried[1] > 1:
             raise ValueError(f"scenario.carried is {self.carried}, but it must have 0 < low <= high <= 1")
-        if self.tries < 1:
-            raise ValueError(f"scenario.tries is {self.tries}, but it must be >= 1")
+        if not 1 <= self.tries <= 10_000:
+            raise ValueError(f"scenario.tries is {self.tries}, but it must be from 1 to 10,000")
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
         """Draw the pose in which the object is held, and the share of the weight that the pad carries.

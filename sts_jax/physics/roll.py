@@ -13,7 +13,7 @@ from sts_jax.physics.contact import PAD_CONTACTS, WALL_CONTACTS, Contacts, Hull,
 from sts_jax.physics.forces import wrench
 from sts_jax.physics.scene import mjx
 
-# An object has settled if it has been slower than SLOW_SPEED and SLOW_TURN for SLOW_TIME.
+# An object has settled if it has been slower than SLOW_SPEED and SLOW_TURN for SLOW_TIME, in contact with pad or wall.
 SLOW_SPEED = 0.005  # m/s
 SLOW_TURN = 0.1  # rad/s
 SLOW_TIME = 0.2  # s
@@ -29,7 +29,7 @@ class State(NamedTuple):
     warmstart: Float[Array, "6"]  # acceleration (MuJoCo's qacc) from which the solver starts
     held: Int[Array, ""]  # steps until the release. The state is frozen until then
     gone: Bool[Array, ""]  # the object has left the pad. The state is frozen from then on
-    slow: Int[Array, ""]  # consecutive slow steps
+    slow: Int[Array, ""]  # consecutive slow steps with a contact in the last PARTED_TIME
     apart: Int[Array, ""]  # consecutive steps without contact
     touches: Int[Array, ""]  # number of contacts that began after at least PARTED_TIME without contact
     sunk: Float[Array, ""]  # m, largest depth of a hull vertex or a contact so far
@@ -121,6 +121,8 @@ def step(model: mjx.Model, data: mjx.Data, hull: Hull, state: State, gravity: Fl
     slow = (geometry.norm(new.qvel[:3]) < SLOW_SPEED) & (geometry.norm(new.qvel[3:]) < SLOW_TURN)
     touched = contact | wall
     begun = touched & (old.apart * timestep >= PARTED_TIME)
+    apart = jnp.where(touched, 0, old.apart + 1)
+    slow &= apart * timestep < PARTED_TIME
     now = State(
         qpos=new.qpos,
         qvel=new.qvel,
@@ -128,7 +130,7 @@ def step(model: mjx.Model, data: mjx.Data, hull: Hull, state: State, gravity: Fl
         held=old.held,
         gone=jnp.max(points[2]) < -GONE_DEPTH,
         slow=jnp.where(slow, old.slow + 1, 0),
-        apart=jnp.where(touched, 0, old.apart + 1),
+        apart=apart,
         touches=old.touches + begun,
         sunk=jnp.maximum(old.sunk, jnp.maximum(_depth(points, model), -jnp.min(contacts.dist))),
         finite=old.finite & jnp.all(jnp.isfinite(new.qpos)) & jnp.all(jnp.isfinite(new.qvel)),

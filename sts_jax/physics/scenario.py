@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from sts_jax import geometry
+from sts_jax._ranges import check as check_ranges
 from sts_jax.physics.scene import Contact
 
 G = 9.81  # m/s^2
@@ -20,6 +21,7 @@ FELL_OFF_HEIGHT = -0.005  # m, an object whose origin (a point inside its hull) 
 MOVED = 0.01  # m, an object that moved less has stayed in place
 TURNED = math.pi / 4  # rad, an object that leans more has toppled, and an object that turned more has rolled
 LEVEL = 0.001  # m, points up to this height above the lowest one support an object, since it may rock onto them
+MOST_STEPS = 10**7  # time steps in a trajectory
 STANDING = 1.04e-5  # m, depth in the pad of an object that stands or lies at rest
 
 
@@ -223,6 +225,7 @@ def _check_kinds(scenario: Scenario) -> None:
         _check_kind(name, getattr(scenario, name), default)
     for name, default in vars(Contact()).items():
         _check_kind(f"contact.{name}", getattr(scenario.contact, name), default)
+    check_ranges(scenario.contact, "scenario.contact.")
 
 
 def _check_kind(name: str, value: object, default: object) -> None:
@@ -265,16 +268,19 @@ def check_length(name: str, value: float) -> None:
 
 def _check_times(scenario: Scenario) -> None:
     rate, timestep = scenario.rate, scenario.contact.timestep
-    if not rate > 0 or not timestep > 0:
-        raise ValueError(f"scenario.rate is {rate}/s and scenario.contact.timestep is {timestep} s: both must be > 0")
+    if not rate > 0:
+        raise ValueError(f"scenario.rate is {rate}/s, but it must be > 0")
     steps = 1 / (rate * timestep)
     if not (steps >= 1 and abs(steps - round(steps)) < 1e-6):
         raise ValueError(
             f"scenario.rate is {rate}/s, which gives {steps:.3f} time steps (of {timestep} s) per frame: give a rate "
             "or a contact.timestep for which the number is whole"
         )
-    if scenario.frames < 1:
-        raise ValueError(f"scenario.frames is {scenario.frames}, but it must be >= 1")
+    if not 1 <= scenario.frames <= MOST_STEPS / round(steps):
+        raise ValueError(
+            f"scenario.frames is {scenario.frames} with {round(steps)} time steps each, but it must be from 1 to "
+            f"{MOST_STEPS // round(steps):,} ({MOST_STEPS:,} time steps)"
+        )
 
 
 def _check_meanings(scenario: Scenario) -> None:

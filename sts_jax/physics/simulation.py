@@ -26,6 +26,7 @@ from sts_jax.physics.arguments import (
 )
 from sts_jax.physics.bodies import BodyError, hulls, rigids, shapes
 from sts_jax.physics.engines import Engine, Rolled, Setup, gravity_at, in_c, in_mjx
+from sts_jax.physics.native import quiet
 from sts_jax.physics.rest import held_wrench
 from sts_jax.physics.roll import SLOW_TIME, Record
 from sts_jax.physics.scenario import Hidden, Outcome, Scenario, Shape, Start
@@ -53,7 +54,8 @@ class Trajectory(NamedTuple):
     contact: Bool[Array, "n f"]  # True if the pad pushes the object in the last time step before the frame.
     wall: Bool[Array, "n f"]  # True if the stop wall pushes the object in the last time step before the frame.
     gravity: Float[Array, "n f 3"]  # Gravity minus the acceleration of the pad, in the sensor frame (m/s^2).
-    # True if the object was slower than 5 mm/s and 0.1 rad/s for the last 0.2 s, or has left the pad.
+    # True if the object touched pad or wall and was slower than 5 mm/s and 0.1 rad/s for the last 0.2 s, or has left the
+    # pad. An object that floats, as without gravity, has not settled.
     settled: Bool[Array, "n"]
     # Number of the outcome, from the poses of the first and the last frame. It is final where `settled` is True.
     outcome: Int[Array, "n"]
@@ -197,7 +199,7 @@ def simulate(
         pad=(float(sensor.gel.size[0]), float(sensor.gel.size[1])),
         time=jnp.asarray(frame - np.arange(scenario.steps, 0, -1) * scenario.contact.timestep),
     )
-    with _reported(progress, len(setup.which), engine) as report:
+    with quiet(), _reported(progress, len(setup.which), engine) as report:
         accepted = _accepted(key, setup, given, chunk, engine, report)
     return _trajectory(setup, sensor, accepted)
 
@@ -255,7 +257,8 @@ def _accepted(
             raise BodyError(
                 int(setup.which[worst]),
                 f"trajectory {nth[worst]} of this body failed in each of {ATTEMPTS} attempts (non-finite values, or "
-                f"deeper than {SUNK_LIMIT} m in the pad or the stop wall): check the body's hull and mass",
+                f"deeper than {SUNK_LIMIT} m in the pad or the stop wall): check the body's hull and mass, and "
+                "scenario.contact",
             )
     rolled = jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *(rows[i] for i in range(count)))
     return _Accepted(starts, hidden, rolled, attempt)

@@ -46,7 +46,7 @@ class Gel:
     # Our choice.
     tolerance: Scalar = dataclasses.field(default=0.005, metadata=POSITIVE)
     # Number of rows and columns of the grid. The default gives cells of 1 mm.
-    cells: tuple[int, int] = dataclasses.field(default=(150, 150), metadata=POSITIVE | STATIC)
+    cells: tuple[int, int] = dataclasses.field(default=(150, 150), metadata=POSITIVE | {"at_most": 4096} | STATIC)
 
 
 @jax.tree_util.register_dataclass

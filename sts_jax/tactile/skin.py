@@ -81,7 +81,7 @@ class Skin:
     coupling: Scalar = dataclasses.field(default=0.0, metadata=NOT_NEGATIVE)
     # Number of points on the way to each light at which the skin may hide it. The default is 0, no shadows, as in the
     # paper.
-    shadow_steps: int = dataclasses.field(default=0, metadata=NOT_NEGATIVE | STATIC)
+    shadow_steps: int = dataclasses.field(default=0, metadata=NOT_NEGATIVE | {"at_most": 1000} | STATIC)
     # Length of the longest shadow along the gel's face (m). Our choice.
     shadow_reach: Scalar = dataclasses.field(default=0.02, metadata=POSITIVE)
     # Angular height of a light, seen from the skin (rad). A point is in partial shadow if only a part of this height is

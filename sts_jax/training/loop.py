@@ -19,13 +19,12 @@ from flax import nnx
 from jaxtyping import Array, PRNGKeyArray
 
 from sts_jax import mvae, statespace, storage
-from sts_jax._ranges import COUNT, NOT_NEGATIVE, POSITIVE, SHARE
+from sts_jax._ranges import COUNT, NOT_NEGATIVE, NUMBER, POSITIVE, SHARE
 from sts_jax._ranges import check as check_ranges
 from sts_jax.training import folder
 from sts_jax.training.arrays import Arrays, Batch, Config, check, order
 from sts_jax.training.folder import KINDS, Model, Record, TrainState, load
 
-_NUMBER = NOT_NEGATIVE | {"whole": True}  # 0 or a larger whole number
 _DECAY = NOT_NEGATIVE | {"below": 1.0}
 Progress = Callable[[int, int, dict[str, float]], None]  # arguments: steps done, steps in total, latest record
 Log = Callable[[int, dict[str, float]], None]  # arguments: step of a record, its other numbers by name
@@ -47,11 +46,11 @@ class TrainConfig:
     epochs: int = field(default=200, metadata=COUNT)  # passes over the training set, used if steps is None (paper: 200)
     batch_size: int = field(default=64, metadata=COUNT)  # samples in a batch (paper: 64)
     # For state-space models: first frames without a trajectory, and trajectories without images, in a batch
-    views: int = field(default=16, metadata=_NUMBER)
-    falls: int = field(default=96, metadata=_NUMBER)
+    views: int = field(default=16, metadata=NUMBER)
+    falls: int = field(default=96, metadata=NUMBER)
     learning_rate: float = field(default=1e-3, metadata=POSITIVE)  # learning rate of Adam (not in the paper)
     schedule: Literal["constant", "cosine"] = "constant"  # course of the learning rate. cosine falls to 0 at the end
-    warmup: int = field(default=0, metadata=_NUMBER)  # first steps, in which the learning rate rises linearly from 0
+    warmup: int = field(default=0, metadata=NUMBER)  # first steps, in which the learning rate rises linearly from 0
     b1: float = field(default=0.9, metadata=_DECAY)  # Adam's decay of the mean gradient
     b2: float = field(default=0.999, metadata=_DECAY)  # Adam's decay of the mean squared gradient
     epsilon: float = field(default=1e-8, metadata=NOT_NEGATIVE)  # Adam's epsilon
@@ -63,7 +62,7 @@ class TrainConfig:
     clip: float | None = field(default=None, metadata=POSITIVE)
     # share of the steps over which beta rises from 0 to 1 (paper: 50 of 200 epochs)
     beta_warmup: float = field(default=0.25, metadata=SHARE)
-    seed: int = field(default=0, metadata=_NUMBER)  # of the initial parameters, the order of the samples and the noise
+    seed: int = field(default=0, metadata=NUMBER)  # of the initial parameters, the order of the samples and the noise
     log_every: int = field(default=10, metadata=COUNT)  # steps whose mean is one record of the training log
     checkpoint_every: int = field(default=200, metadata=COUNT)  # steps, a multiple of log_every
 
