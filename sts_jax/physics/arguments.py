@@ -40,8 +40,8 @@ def check_arguments(bodies: Sequence[Any], sensor: Any, scenario: Any, **counts:
     records = len(bodies) * counts["num"] * scenario.frames
     if records > MOST_RECORDS:
         raise ValueError(
-            f"num is {counts['num']}, which gives {records:,} frames of {len(bodies)} bodies, about {records / 1e7:,.0f} "
-            f"GB: call it several times with at most {MOST_RECORDS:,} frames and other keys"
+            f"num is {counts['num']}, which gives {records:,} frames, about {records / 1e7:,.0f} GB: call it several "
+            f"times with at most {MOST_RECORDS:,} frames and other keys"
         )
     check_bodies(bodies)
 

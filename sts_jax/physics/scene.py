@@ -33,11 +33,12 @@ PAD_DEPTH = 0.2  # m, an object that leaves the pad slides down its side and nev
 WALL_DEPTH = 0.01  # m, thickness of the stop wall
 WALL_OVERHANG = 0.5  # m, reach of the wall beyond the pad on either side, so that no object gets to its ends
 CONDIM = 6  # solver rows of a contact: normal, two for sliding, one for torsion, two for rolling
-# Largest friction of an object, relative to half the smallest width of its hull. Torsion acts over the patch of contact,
-# which is no wider than the object: at a coefficient of 0.75, a patch of this radius has 2/3 0.75 = 0.5. Rolling friction
-# widens the base over which an object topples: a cube can rest within 1.6 degrees of its balance on an edge, and of 2,000
-# dropped cubes of 5 to 50 mm none does. With twice the share, 1 % of cubes of 50 mm lean on an edge at the end.
-TORSION, ROLLING = 0.5, 0.04
+# Largest friction of an object, relative to half the smallest width of its hull. Torsion acts over the contact patch,
+# which is no wider than the object: with a sliding friction of 0.75, a patch of that radius has 2/3 * 0.75 = 0.5.
+TORSION = 0.5
+# Rolling friction widens the base over which an object topples. With this share, a cube can rest within 1.6 degrees of
+# its balance on an edge, and none of 1,500 dropped cubes of 5 to 50 mm does. With twice the share, 1 % do.
+ROLLING = 0.04
 _IMPEDANCE = {"at_least": 0.0001, "at_most": 0.9999}  # MuJoCo cuts impedances off at these limits
 SMALLEST_SLIP = 1e-6  # lower bound of |u + alpha v|^2 / |u|^2 in the line search, larger than float32's rounding
 
@@ -82,10 +83,10 @@ class Contact:
     # depth over which the impedance rises (m), the third number of MuJoCo's solimp (with a large value, an object that
     # leans over an edge sinks in and tips early, in both engines)
     width: float = field(default=0.00002, metadata=POSITIVE)
-    # torsional friction (m, the default of MuJoCo), at most 1/2 of half the smallest width of the object's hull
+    # torsional friction (m, the default of MuJoCo, at most 1/2 of half the smallest width of the object's hull)
     torsional: float = field(default=0.005, metadata=NOT_NEGATIVE)
-    # rolling friction (m, must be small, because the base over which an object topples becomes wider by this length), at
-    # most 1/25 of half the smallest width of the object's hull
+    # rolling friction (m, must be small, because the base over which an object topples becomes wider by this length, at
+    # most 1/25 of half the smallest width of the object's hull)
     rolling: float = field(default=0.0002, metadata=NOT_NEGATIVE)
     # stiffness of friction relative to the normal force (a high value keeps objects at rest from creeping)
     impratio: float = field(default=10.0, metadata=POSITIVE)

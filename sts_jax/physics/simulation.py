@@ -54,8 +54,8 @@ class Trajectory(NamedTuple):
     contact: Bool[Array, "n f"]  # True if the pad pushes the object in the last time step before the frame.
     wall: Bool[Array, "n f"]  # True if the stop wall pushes the object in the last time step before the frame.
     gravity: Float[Array, "n f 3"]  # Gravity minus the acceleration of the pad, in the sensor frame (m/s^2).
-    # True if the object touched pad or wall and was slower than 5 mm/s and 0.1 rad/s for the last 0.2 s, or has left the
-    # pad. An object that floats, as without gravity, has not settled.
+    # True if the object touched pad or wall, slower than 5 mm/s and 0.1 rad/s, for the last 0.2 s, or has left the pad.
+    # An object that floats, as without gravity, has not settled.
     settled: Bool[Array, "n"]
     # Number of the outcome, from the poses of the first and the last frame. It is final where `settled` is True.
     outcome: Int[Array, "n"]
