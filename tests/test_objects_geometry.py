@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from object_files import surface
 
 from sts_jax import objects
@@ -124,3 +125,69 @@ def test_the_triangles_of_a_ply_polygon_keep_its_colours(tmp_path):
     top = (drawn.triangles[..., 2] > drawn.vertices[:, 2].mean()).all(axis=1)
     np.testing.assert_allclose(np.asarray(body.colors)[: len(top), :, 0], np.tile(top[:, None], 3), atol=1e-6)
     assert top.sum() == 6
+
+
+def box(*size: float, at: tuple[float, float, float] = (0.0, 0.0, 0.0), inward: bool = False) -> trimesh.Trimesh:
+    mesh = trimesh.creation.box(np.array(size) * 1e-3, trimesh.transformations.translation_matrix(np.array(at) * 1e-3))
+    if inward:
+        mesh.invert()
+    return mesh
+
+
+def saved(folder: Path, *meshes: trimesh.Trimesh) -> Path:
+    trimesh.util.concatenate(meshes).export(folder / "mesh.ply")
+    return folder / "mesh.ply"
+
+
+@pytest.mark.parametrize("outer", [False, True])
+@pytest.mark.parametrize("inner", [False, True])
+def test_each_closed_part_is_turned_outwards_and_a_cavity_inwards(tmp_path, outer, inner):
+    cavity, beside = box(30, 20, 10, inward=inner), box(20, 20, 20, at=(50, 0, 0), inward=inner)
+    body = objects.load(saved(tmp_path, box(60, 40, 30, inward=outer), cavity, beside), strict=True)
+    assert volume(body) == pytest.approx((60 * 40 * 30 - 30 * 20 * 10 + 20**3) * 1e-9, rel=1e-5)
+    assert surface(body).volume == pytest.approx(volume(body), rel=1e-5)
+    assert not body.two_sided
+
+
+def test_reversed_faces_within_a_part_are_turned_and_keep_their_colours(tmp_path):
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.03)
+    paint = np.where(ball.vertices[:, 2:] > 0, [[255, 0, 0, 255]], [[0, 0, 255, 255]])
+    ball.visual.vertex_colors = paint
+    truth = ball.volume
+    ball.faces = np.where(
+        np.random.default_rng(0).random(len(ball.faces))[:, None] < 0.3, ball.faces[:, ::-1], ball.faces
+    )
+    body = objects.load(saved(tmp_path, ball), strict=True)
+    assert volume(body) == pytest.approx(truth, rel=1e-5)
+    drawn = surface(body)
+    red = np.asarray(body.colors)[: len(drawn.faces), :, 0]
+    np.testing.assert_allclose(
+        red[abs(drawn.triangles[..., 2]) > 1e-5], (drawn.triangles[..., 2] > 0)[abs(drawn.triangles[..., 2]) > 1e-5]
+    )
+
+
+@pytest.mark.parametrize("inward", [False, True])
+def test_repeated_faces_of_a_closed_surface_are_dropped_with_a_warning(tmp_path, inward):
+    once = objects.load(saved(tmp_path, box(60, 40, 30)))
+    with pytest.warns(UserWarning, match=r"mesh\.ply: 12 repeated faces are dropped"):
+        twice = objects.load(saved(tmp_path, box(60, 40, 30), box(60, 40, 30, inward=inward)), strict=True)
+    assert volume(twice) == pytest.approx(volume(once))
+    assert twice.shell_mass == once.shell_mass
+
+
+def test_the_two_sides_of_an_open_sheet_stay(tmp_path):
+    bowl = trimesh.creation.icosphere(subdivisions=2, radius=0.04)
+    bowl.update_faces(bowl.triangles_center[:, 2] < 0)
+    behind = bowl.copy()
+    behind.invert()
+    one = objects.load(saved(tmp_path, bowl), mass=0.1)
+    both = objects.load(saved(tmp_path, bowl, behind), mass=0.1)
+    assert len(surface(both).faces) == 2 * len(surface(one).faces)
+
+
+def test_repeated_polygons_are_dropped_whatever_their_first_corner(tmp_path):
+    vertices, polygons = prism(OUTLINES["letter"])
+    again = [polygon[3:] + polygon[:3] for polygon in polygons[::2]] + [polygon[::-1] for polygon in polygons[1::2]]
+    with pytest.warns(UserWarning, match="28 repeated faces are dropped"):
+        body = objects.load(write(tmp_path / "x.obj", vertices, polygons + again))
+    assert volume(body) == pytest.approx(shoelace(np.array(OUTLINES["letter"]) * 1e-3) * 0.01, rel=1e-4)

@@ -20,7 +20,7 @@ from sts_jax.objects.formats import read
 from sts_jax.objects.hulls import convex_hull
 from sts_jax.objects.materials import albedo
 from sts_jax.objects.parts import decompose
-from sts_jax.objects.surface import Surface, decimate, is_closed, merge
+from sts_jax.objects.surface import Surface, decimate, is_closed, merge, repaired
 
 # Up and front directions of a file for which only the up axis is given. Up becomes +z, and front becomes -y. The front
 # of a glTF file is +z (glTF specification).
@@ -126,6 +126,7 @@ def load(
         if texture is not None:
             _wear(pieces, Path(texture))
         surface = merge(corners * _factor(path, corners, longest_side, scale, largest), *albedo(path, pieces))
+        surface = repaired(path, surface)
         if faces is not None and max(len(surface.faces), len(surface.vertices)) > faces:
             surface = decimate(path, surface, faces)
         body = _body(path, surface, mass, density, hollow, strict, category)
@@ -191,17 +192,15 @@ def _body(
             f"the mesh has {len(faces):,} faces and {len(vertices):,} vertices, but at most {FACE_CLASSES[-1]:,} "
             f"of each are allowed: pass faces={FACE_CLASSES[-1]} to limit both by decimation"
         )
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
     closed = is_closed(faces)
-    if closed and mesh.volume < 0:
-        faces, colors, uv = faces[:, ::-1], colors[:, ::-1], uv[:, ::-1]
+    enclosed = np.linalg.det(vertices[faces] - vertices.mean(axis=0)).sum() / 6
     try:
         hull = ConvexHull(vertices)
     except (QhullError, ValueError) as error:  # ValueError: there are too few vertices
         raise ValueError("the mesh is flat, so even its convex hull has no volume: give it a thickness") from error
     interior = (vertices, faces)
     holds = hollow and mass is None
-    if not (closed and abs(mesh.volume) > 1e-6 * hull.volume):
+    if not (closed and enclosed > 1e-6 * hull.volume):
         fault = "encloses no volume" if closed else "is not closed"
         if strict:
             raise ValueError(f"the mesh {fault}: repair it, or give strict=False, and its hull bounds the contents")

@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull, KDTree
 
 from sts_jax.objects.body import HULL_CLASSES, PART_CLASSES, Body, pad, size_class
 from sts_jax.objects.hulls import convex_hull, outside_hull
-from sts_jax.objects.surface import surface_samples
+from sts_jax.objects.surface import surface_samples, winding
 
 
 def convex_parts(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> list[Float[np.ndarray, "_ 3"]]:
@@ -126,17 +126,7 @@ def _reach(points: np.ndarray, triangles: np.ndarray, closed: bool) -> float:
             if distance[index] <= max(largest, 1e-6):
                 break
             behind, before = front[:, index]
-            if not closed or (before and (not behind or _turns(points[some[index]], triangles) < 0.5)):
+            if not closed or (before and (not behind or winding(points[some[index]], triangles) < 0.5)):
                 largest = float(distance[index])
                 break
     return largest
-
-
-def _turns(point: np.ndarray, triangles: np.ndarray) -> float:
-    """Compute the winding number of triangles around a point: 1 inside, 0 outside (van Oosterom and Strackee, 1983)."""
-    a, b, c = np.moveaxis(triangles - point, 1, 0)
-    one, two, three = (np.linalg.norm(side, axis=1) for side in (a, b, c))
-    across = np.einsum("fi,fi->f", a, np.cross(b, c))
-    dots = (np.einsum("fi,fi->f", left, right) for left, right in ((a, b), (b, c), (c, a)))
-    along = one * two * three + sum(dot * size for dot, size in zip(dots, (three, one, two), strict=True))
-    return float(np.arctan2(across, along).sum() / (2 * np.pi))

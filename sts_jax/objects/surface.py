@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 
@@ -45,6 +47,78 @@ def proper(surface: Surface) -> Surface:
     )
 
 
+def repaired(path: Path, surface: Surface) -> Surface:
+    """Drop repeated faces, and turn the faces of each closed part outwards, or inwards around a cavity.
+
+    A part is a set of faces that are connected by edges of exactly two faces. The two sides of an open sheet both stay.
+    """
+    faces = surface.faces
+    _, first, place = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_inverse=True)
+    place = place.reshape(-1)
+    odd = (faces > np.roll(faces, 1, axis=1)).sum(axis=1) == 1  # an odd permutation of the sorted corners
+    part, turned, closed = _parts(faces[first])
+    corners = surface.vertices[faces[first]] - surface.vertices.mean(axis=0)
+    corners[turned] = corners[turned, ::-1]
+    volume = np.bincount(part, np.linalg.det(corners)) / 6
+    inverted = np.bincount(part, np.where(turned, 1, -1)) > 0  # an open part keeps the direction of most faces
+    shells = np.split(corners[np.argsort(part, kind="stable")], np.cumsum(np.bincount(part))[:-1])
+    cavity = _depths([shell for shell, whole in zip(shells, closed, strict=True) if whole]) % 2 == 1
+    inverted[closed] = (volume[closed] < 0) != cavity
+    kept = np.zeros(len(faces), bool)
+    kept[first] = True
+    kept |= ~closed[part[place]] & (odd != odd[first][place])
+    _, sides = np.unique(np.stack([place, odd], axis=1)[kept], axis=0, return_index=True)
+    kept = np.flatnonzero(kept)[np.sort(sides)]
+    if len(kept) < len(faces):
+        warnings.warn(f"{path}: {len(faces) - len(kept):,} repeated faces are dropped", stacklevel=3)
+    flip = (turned != inverted[part])[place]
+    turn = np.where(flip[:, None], [2, 1, 0], [0, 1, 2])[kept]
+    return surface._replace(
+        faces=np.take_along_axis(faces[kept], turn, axis=1),
+        colors=np.take_along_axis(surface.colors[kept], turn[..., None], axis=1),
+        uv=np.take_along_axis(surface.uv[kept], turn[..., None], axis=1),
+    )
+
+
+def _depths(shells: list[np.ndarray]) -> np.ndarray:
+    """Count the closed surfaces, each as triangles (f, 3, 3), in which each of them lies."""
+    low, high = (np.array([edge(shell, (0, 1)) for shell in shells]).reshape(-1, 3) for edge in (np.amin, np.amax))
+    depths = np.zeros(len(shells), int)
+    for index, shell in enumerate(shells):
+        points = shell.reshape(-1, 3)[:: 1 + 3 * len(shell) // 32]
+        for other in np.flatnonzero((low < low[index]).all(axis=1) & (high > high[index]).all(axis=1)):
+            depths[index] += all(abs(winding(point, shells[other])) > 0.5 for point in points)
+    return depths
+
+
+def _parts(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the part of each face, whether it must turn to agree with its part, and whether each part is closed."""
+    number = len(faces)
+    start, end = faces.reshape(-1).astype(np.int64), np.roll(faces, -1, axis=1).reshape(-1)
+    edge = np.minimum(start, end) * (faces.max() + 1) + np.maximum(start, end)
+    _, edge, count = np.unique(edge, return_inverse=True, return_counts=True)
+    edge = edge.reshape(-1)
+    order = np.argsort(edge, kind="stable")
+    one, two = order[count[edge[order]] == 2].reshape(-1, 2).T
+    same = (start < end)[one] == (start < end)[two]  # neighbours of opposite orientations
+    one, two = one // 3, two // 3
+    # Each face stands twice in a graph, as it is and turned, so that its component also says how it is turned.
+    ends = np.concatenate(
+        [[one, np.where(same, two + number, two)], [one + number, np.where(same, two, two + number)]], axis=1
+    )
+    graph = coo_array((np.ones(ends.shape[1], bool), tuple(ends)), shape=(2 * number, 2 * number))
+    plain, other = connected_components(graph, directed=False)[1].reshape(2, number)
+    _, part = np.unique(np.minimum(plain, other), return_inverse=True)
+    part, turned = part.reshape(-1), plain > other
+    forward = np.where((start < end) != np.repeat(turned, 3), 1, -1)
+    sides = np.repeat(part, 3) * len(count) + edge
+    sides, place = np.unique(sides, return_inverse=True)
+    open_sides = np.bincount(place.reshape(-1), forward) != 0
+    closed = np.bincount(sides // len(count), open_sides) == 0
+    closed[part[plain == other]] = False  # a Moebius strip
+    return part, turned, closed
+
+
 def is_closed(faces: np.ndarray) -> bool:
     """Return whether triangular faces (f, 3) have the edge a to b as often as b to a, for all vertices a and b.
 
@@ -55,6 +129,16 @@ def is_closed(faces: np.ndarray) -> bool:
     edge = np.minimum(start, end) * (faces.max() + 1) + np.maximum(start, end)
     _, place = np.unique(edge, return_inverse=True)
     return not np.bincount(place.reshape(-1), np.where(start < end, 1, -1)).any()
+
+
+def winding(point: np.ndarray, triangles: np.ndarray) -> float:
+    """Compute the winding number of triangles around a point: 1 inside, 0 outside (van Oosterom and Strackee, 1983)."""
+    a, b, c = np.moveaxis(triangles - point, 1, 0)
+    one, two, three = (np.linalg.norm(side, axis=1) for side in (a, b, c))
+    across = np.einsum("fi,fi->f", a, np.cross(b, c))
+    dots = (np.einsum("fi,fi->f", left, right) for left, right in ((a, b), (b, c), (c, a)))
+    along = one * two * three + sum(dot * size for dot, size in zip(dots, (three, one, two), strict=True))
+    return float(np.arctan2(across, along).sum() / (2 * np.pi))
 
 
 def surface_samples(
