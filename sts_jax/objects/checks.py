@@ -9,6 +9,8 @@ from jaxtyping import Float
 
 from sts_jax.objects.body import FACE_CLASSES, PAD, SMALLEST
 
+LARGEST_UV = 1e4  # repetitions of a texture, beyond which float32 does not resolve its texels
+
 
 def check_positive(name: str, value: float | None, unit: str) -> None:
     """Raise a ValueError unless a setting is None or a positive, finite number."""
@@ -60,3 +62,13 @@ def checked_corners(pieces: Sequence[trimesh.Trimesh], limit: int | None) -> Flo
     if not np.ptp(corners, axis=(0, 1)).max() > 0:
         raise ValueError("all vertices lie at one point: repair the mesh")
     return corners
+
+
+def check_appearance(colors: Float[np.ndarray, "f 3 3"], uv: Float[np.ndarray, "f 3 2"]) -> None:
+    """Raise a ValueError unless colours are finite, and texture coordinates as well and of a possible size."""
+    if not np.isfinite(colors).all():
+        raise ValueError("the mesh has colours that are NaN or infinite: repair its colours or materials")
+    if not (np.abs(uv) <= LARGEST_UV).all():
+        raise ValueError(
+            f"the mesh has texture coordinates that are NaN or beyond {LARGEST_UV:,.0f}: repair them or remove the image"
+        )

@@ -82,6 +82,7 @@ def read_image(source: Path | bytes, name: str = "") -> Image.Image:
             warnings.simplefilter("ignore")  # of large images
             with Image.open(io.BytesIO(source) if isinstance(source, bytes) else source) as picture:
                 picture.draft("RGB", (LARGE, LARGE))
+                picture.load()
                 picture = rgb(picture)
     except Image.DecompressionBombError as error:
         limit = 2 * (Image.MAX_IMAGE_PIXELS or 0)
@@ -95,7 +96,7 @@ def read_image(source: Path | bytes, name: str = "") -> Image.Image:
 def rgb(picture: Image.Image) -> Image.Image:
     """Convert an image to RGB with 8 bits. Grey values of 16 bits, which Pillow clips, and floats are scaled."""
     if picture.mode[0] not in "IF":
-        return picture.convert("RGB")
+        return picture if picture.mode == "RGB" else picture.convert("RGB")
     values = np.asarray(picture, float)
     full = 1.0 if picture.mode == "F" else 65535.0
     if not (np.isfinite(values).all() and 0 <= values.min() <= values.max() <= full):

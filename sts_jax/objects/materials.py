@@ -7,6 +7,7 @@ import trimesh
 from PIL import Image
 
 from sts_jax.objects.body import TEXTURE_CLASSES
+from sts_jax.objects.checks import check_appearance
 from sts_jax.objects.colors import PLAIN, linear
 from sts_jax.objects.files import rgb
 
@@ -17,7 +18,8 @@ def albedo(path: Path, pieces: list[trimesh.Trimesh]) -> tuple[np.ndarray, np.nd
     colors, uvs, images = [], [], []
     for piece in pieces:
         color, uv, image = _piece_albedo(piece, is_linear)
-        colors.append(color)
+        check_appearance(color, uv)
+        colors.append(np.clip(color, 0, 1))
         uvs.append(uv)
         images.append(image)
     pictures = [image for image in images if image is not None]
