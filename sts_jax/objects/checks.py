@@ -69,6 +69,4 @@ def check_appearance(colors: Float[np.ndarray, "f 3 3"], uv: Float[np.ndarray, "
     if not np.isfinite(colors).all():
         raise ValueError("the mesh has colours that are NaN or infinite: repair its colours or materials")
     if not (np.abs(uv) <= LARGEST_UV).all():
-        raise ValueError(
-            f"the mesh has texture coordinates that are NaN or beyond {LARGEST_UV:,.0f}: repair them or remove the image"
-        )
+        raise ValueError(f"the mesh has texture coordinates that are NaN or beyond {LARGEST_UV:,.0f}: repair them")

@@ -80,10 +80,10 @@ def read_image(source: Path | bytes, name: str = "") -> Image.Image:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of large images
-            with Image.open(io.BytesIO(source) if isinstance(source, bytes) else source) as picture:
-                picture.draft("RGB", (LARGE, LARGE))
-                picture.load()
-                picture = rgb(picture)
+            with Image.open(io.BytesIO(source) if isinstance(source, bytes) else source) as opened:
+                opened.draft("RGB", (LARGE, LARGE))
+                opened.load()
+                picture = rgb(opened)
     except Image.DecompressionBombError as error:
         limit = 2 * (Image.MAX_IMAGE_PIXELS or 0)
         raise Refusal(f"{name}: the image has more than {limit:,} pixels: reduce it to 1,024 x 1,024") from error

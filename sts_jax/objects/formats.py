@@ -58,7 +58,7 @@ def read(files: Files, strict: bool) -> list[trimesh.Trimesh]:
     except ModuleNotFoundError as error:
         raise ValueError(f"the file cannot be read ({error}): install the package {error.name}") from error
     except Exception as error:  # the many readers raise errors of many types
-        text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+        text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__} {error}"
         raise ValueError(
             f"the file cannot be read as a mesh ({text}): check that it is complete and has the right suffix"
         ) from error
@@ -264,7 +264,7 @@ def _numbers(rows: list[list[bytes]], least: int, what: str) -> np.ndarray:
     """Make an array of rows that have at least `least` numbers each."""
     columns = min(map(len, rows), default=least)
     if columns < least:
-        short = _name(b" ".join(min(rows, key=len)))
+        short = _name(b" ".join(next(row for row in rows if len(row) == columns)))
         raise Refusal(f"a {what} has fewer than {least} numbers ({short!r}): repair the file")
     return np.array([row[:columns] for row in rows], float).reshape(-1, columns)
 
@@ -315,7 +315,7 @@ def _off(data: bytes, files: Files) -> list[trimesh.Trimesh]:
 
 def _header(data: bytes) -> tuple[dict[str, Any], bytes]:
     """Return the JSON header and the binary part of a glTF or GLB."""
-    parts = {}
+    parts: dict[int, bytes] = {}
     if data[:4] == b"glTF":
         version, length = struct.unpack_from("<II", data, 4)
         start = 12

@@ -54,6 +54,7 @@ def rotation(up: Sequence[float], front: Sequence[float]) -> Float[np.ndarray, "
 
 
 @checked
+@np.errstate(all="ignore")  # what a damaged file makes of numbers is checked afterwards
 def load(
     path: str | os.PathLike[str],
     *,
