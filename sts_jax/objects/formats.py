@@ -274,7 +274,7 @@ def _stl(data: bytes, _: Files) -> list[trimesh.Trimesh]:
     number = int.from_bytes(data[80:84], "little")
     text = data.removeprefix(b"\xef\xbb\xbf").lstrip().lower()
     if 84 + 50 * number != len(data) and text.startswith(b"solid") and b"\0" not in text[:1024]:
-        if b"endsolid" not in text[-1024:]:
+        if text.rfind(b"endsolid") <= text.rfind(b"endfacet"):
             raise Refusal("the file is truncated (its last line is not `endsolid`): replace the file")
         corners = np.array(re.findall(rb"[\r\n]\s*vertex\s+(\S+)\s+(\S+)\s+(\S+)", text), float).reshape(-1, 3)
         if len(corners) != 3 * len(re.findall(rb"[\r\n]\s*endfacet", text)):
