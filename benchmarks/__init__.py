@@ -2,3 +2,5 @@
 
 The option `--help` of each command describes the command.
 """
+
+import experiments as experiments  # what Ctrl-C does, and the variables of the environment

@@ -42,8 +42,5 @@ def main(config: Config) -> None:
 
 if __name__ == "__main__":
     arguments = tyro.cli(Config, description=__doc__)
-    try:
-        with on_one_line():
-            main(arguments)
-    except KeyboardInterrupt:
-        raise SystemExit("interrupted. The pictures of the board are kept: run the command again to continue") from None
+    with on_one_line():
+        main(arguments)

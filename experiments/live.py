@@ -29,7 +29,7 @@ import PIL.Image
 import tyro
 
 import sts_jax as sts
-from experiments.shared import drawing, terminal
+from experiments.shared import drawing, interrupts, terminal
 from experiments.shared.device import own_twin
 from experiments.shared.live import Image, Live, Seen, Views, panel
 from experiments.shared.page import LivePage
@@ -142,6 +142,7 @@ def follow(config: Config, source: Source, predictor: sts.Predictor, page: LiveP
         Live(predictor, views, config.condition) as live,
         source.sensor,
         contextlib.closing(images(config, source)) as shots,
+        interrupts.in_order(),
     ):
         started_s = printed_s = time.monotonic()
         try:
@@ -180,20 +181,16 @@ def save(path: Path, moments: list[Image]) -> None:
 def main(config: Config) -> None:
     """Load the model, and show predictions until the images end, the time `--seconds` is over, or a user quits."""
     with terminal.on_one_line(debug=config.debug):
-        try:
-            check(config)
-            sts.enable_compilation_cache()
-            predictor = sts.Predictor.load(config.model)
-            with opened(config) as source, contextlib.ExitStack() as stack:
-                page = None
-                if not config.headless:
-                    page = LivePage(config.host, config.port, title=f"{source.name}. Model: {config.model}")
-                    stack.callback(page.close)
-                follow(config, source, predictor, page)
-        except KeyboardInterrupt:
-            raise SystemExit("stopped") from None
+        check(config)
+        sts.enable_compilation_cache()
+        predictor = sts.Predictor.load(config.model)
+        with opened(config) as source, contextlib.ExitStack() as stack:
+            page = None
+            if not config.headless:
+                page = LivePage(config.host, config.port, title=f"{source.name}. Model: {config.model}")
+                stack.callback(page.close)
+            follow(config, source, predictor, page)
 
 
 if __name__ == "__main__":
-    terminal.interrupt_on_sigterm()
     main(tyro.cli(Config, description=__doc__))

@@ -68,19 +68,15 @@ def parse(words: Sequence[str]) -> Train | Collect | Review:
 def main(config: Train | Collect | Review) -> None:
     """Run a sub-command. If the user can correct an error, print the error on one line without a traceback."""
     with terminal.on_one_line(debug=config.debug):
-        try:
-            match config:
-                case Train():
-                    table2.main(config)
-                case Collect():
-                    collect(config)
-                case Review():
-                    review(config)
-        except KeyboardInterrupt:
-            raise SystemExit("stopped") from None
+        match config:
+            case Train():
+                table2.main(config)
+            case Collect():
+                collect(config)
+            case Review():
+                review(config)
 
 
 if __name__ == "__main__":
     sts.enable_compilation_cache()
-    terminal.interrupt_on_sigterm()
     main(parse(sys.argv[1:]))

@@ -14,7 +14,7 @@ import threading
 import tyro
 
 import sts_jax as sts
-from experiments.shared import terminal
+from experiments.shared import interrupts, terminal
 from experiments.shared.device import TwinConfig, make_twin
 from sts_jax.hardware import twin
 
@@ -25,6 +25,7 @@ def main(config: TwinConfig) -> None:
     with (
         make_twin(config) as device,
         twin.Served(device, link=config.port, host=config.host, http_port=config.http_port) as served,
+        interrupts.in_order(),
     ):
         print(f"{served.description}\nCtrl-C ends it.", flush=True)
         if config.attached:
@@ -35,6 +36,5 @@ def main(config: TwinConfig) -> None:
 
 if __name__ == "__main__":
     sts.enable_compilation_cache()
-    terminal.interrupt_on_sigterm()
     with terminal.on_one_line(), contextlib.suppress(KeyboardInterrupt):
         main(tyro.cli(TwinConfig, description=__doc__))

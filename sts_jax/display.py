@@ -12,6 +12,7 @@ from jaxtyping import ArrayLike
 from matplotlib.figure import Figure
 from PIL import Image
 
+from sts_jax._checked import check_arrays
 from sts_jax.evaluation.figures.motion import outside
 from sts_jax.frame import Frame
 from sts_jax.objects import Body
@@ -120,6 +121,7 @@ def save(path: str | os.PathLike[str], thing: Frame | Body | Trajectory | ArrayL
             )
         leaves, _ = jax.tree_util.tree_flatten_with_path(thing)
         arrays = {jax.tree_util.keystr(key, simple=True, separator="/"): np.asarray(leaf) for key, leaf in leaves}
+        _check_stored(type(thing), arrays)
         arrays |= {"kind": np.array(type(thing).__name__), "format": np.array(_FORMAT)}
         data = io.BytesIO()
         np.savez_compressed(data, allow_pickle=False, **arrays)
@@ -142,12 +144,22 @@ def load(path: str | os.PathLike[str]) -> Any:
         kind, version = _KINDS[str(arrays.pop("kind"))], int(arrays.pop("format"))
         if version != _FORMAT:
             raise ValueError(f"the file has format {version}, but this version of sts_jax reads format {_FORMAT}")
+        _check_stored(kind, arrays)
         return _built(kind, {key: jnp.asarray(value) for key, value in arrays.items()})
     except Exception as error:  # A damaged zip file raises exceptions of many types.
         reason = f"{type(error).__name__}: {error}"
         raise DamagedFileError(
             f"{path} is damaged or was not written by this version of sts.save ({reason}). Save the item again."
         ) from error
+
+
+def _check_stored(kind: type, arrays: dict[str, Any]) -> None:
+    """Raise a ValueError unless these are the arrays of a frame, body or trajectory."""
+    if kind is Frame and {"pose", "balanced"} <= arrays.keys():  # `sense` returns an invalid pose unchanged
+        arrays = arrays | {"pose": np.where(np.asarray(arrays["balanced"])[..., None], arrays["pose"], 0)}
+    check_arrays(kind, arrays, infinite=("depth",))
+    if kind is Body and np.ndim(arrays["vertices"]) == 2:
+        _built(Body, {name: jnp.asarray(array) for name, array in arrays.items()}).check()
 
 
 def _built(kind: type, arrays: dict[str, Any]) -> Any:

@@ -86,7 +86,7 @@ class Predictor:
         path = _located(folder)
         model = training.load(path)
         try:
-            preprocessing = training.Preprocessing.from_json(model.settings["preprocessing"])
+            preprocessing = training.Preprocessing.from_json(model.settings.get("preprocessing"))
         except ValueError as error:
             raise ValueError(
                 f"the field 'preprocessing' of {path / 'config.json'} is not valid: {error}. Train the model with "

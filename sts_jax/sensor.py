@@ -1,5 +1,6 @@
 """`Sensor`: all constants of one sensor, with methods that check them, save them and load them."""
 
+import contextlib
 import dataclasses
 import functools
 import os
@@ -15,7 +16,7 @@ from jaxtyping import Array, Bool
 
 from sts_jax._ranges import NOT_NEGATIVE, STATIC, limits
 from sts_jax.optics import Camera, Room
-from sts_jax.storage import read_json, write_json
+from sts_jax.storage import DamagedFileError, digest, read_json, read_manifest, verify, write_json
 from sts_jax.tactile import Gel, Leds, Lights, Phong, Skin
 
 _LIGHTS: dict[str, type[Lights] | type[Leds]] = {"Lights": Lights, "Leds": Leds}  # by `lights.kind` in a file
@@ -89,23 +90,35 @@ class Sensor:
         return _plain(self)
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write all constants to a JSON file, atomically."""
+        """Write all constants and their checksum to a JSON file, atomically."""
         self.check()
-        write_json(Path(path), self.constants())
+        write_json(Path(path), {**self.constants(), "checksum": digest(self.constants())})
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> "Sensor":
         """Read a sensor from a file that `save` wrote, or from that of a real sensor, whose entry "device" is ignored.
 
-        A missing field has its default value, and an unknown field raises a ValueError.
+        A missing field has its default value, and an unknown field raises a ValueError. The file is compared with its
+        checksum, if it has one, and with the manifest of its folder, if that lists it.
         """
-        if not Path(path).exists():
+        path, again = Path(path), "write it again with Sensor.save"
+        if not path.exists():
             raise FileNotFoundError(
                 f"{path} does not exist: give a file that Sensor.save wrote, or the sensor.json of a dataset"
             )
-        values = read_json(Path(path), "write it again with Sensor.save")
+        manifest = None
+        with contextlib.suppress(DamagedFileError):  # a manifest of other programs
+            manifest = read_manifest(path.parent, "")
+        if manifest is not None and path.name in manifest.files:
+            verify(path.parent, manifest, "restore it, or write a file of another name with Sensor.save", [path.name])
+        values = read_json(path, again)
         if isinstance(values, dict):
             values.pop("device", None)
+            if values.pop("checksum", None) not in (None, digest(values)):
+                raise DamagedFileError(
+                    f"{path} is damaged or was edited (its checksum differs): {again}, or delete the field `checksum` "
+                    "to accept your changes."
+                )
         try:
             sensor = _typed(cls(), values, "")
             sensor.check()

@@ -1,6 +1,7 @@
 """Atomic writing of files and folders, reading of files with helpful errors, manifests, and locks on folders."""
 
 import contextlib
+import dataclasses
 import errno
 import functools
 import hashlib
@@ -11,7 +12,7 @@ import platform
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import filelock
 import numpy as np
@@ -19,6 +20,7 @@ import pydantic
 from pydantic_core import ErrorDetails
 
 Fields = TypeVar("Fields")  # a dataclass
+Finite = Annotated[float, pydantic.Field(allow_inf_nan=False)]
 
 
 class DamagedFileError(OSError):
@@ -91,7 +93,7 @@ def read_json(path: Path, remedy: str) -> Any:
         return json.loads(path.read_bytes().decode())
     except FileNotFoundError:
         raise
-    except (OSError, ValueError) as error:  # ValueError: invalid UTF-8 or JSON, or an integer of thousands of digits
+    except (OSError, ValueError, RecursionError) as error:  # ValueError: invalid UTF-8 or JSON, or too many digits
         raise DamagedFileError(f"{path} cannot be read as JSON ({error}): {remedy}.") from error
 
 
@@ -129,6 +131,14 @@ def _first_fault(fault: ErrorDetails, name: str) -> str:
         case "value_error":  # raised by the dataclass itself
             return str(fault["ctx"]["error"])
     return f"field {place} is {fault['input']!r}: {fault['msg']}"
+
+
+def read_fields(kind: type[Fields], path: Path, remedy: str) -> Fields:
+    """Read a JSON file as a dataclass. The arguments are those of `decode` and `read_json`."""
+    try:
+        return decode(kind, read_json(path, remedy), "content")
+    except ValueError as error:
+        raise DamagedFileError(f"{path} has another content than expected ({error}): {remedy}.") from None
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
@@ -225,23 +235,38 @@ def write_manifest(folder: Path, files: Mapping[str, str], facts: Mapping[str, A
     return Manifest(**content)
 
 
-def read_manifest(folder: Path, remedy: str, *facts: str) -> Manifest | None:
+@dataclasses.dataclass(frozen=True)
+class _Content:
+    """The content of `manifest.json`."""
+
+    files: dict[str, str]
+    facts: dict[str, Any]
+    checksum: str
+
+
+def read_manifest(folder: Path, remedy: str, kind: type[Any] | None = None) -> Manifest | None:
     """Read `manifest.json`, without comparing the files. None if the folder has no such file.
 
     Args:
         remedy: Text at the end of the error message, with the remedy for a damaged, edited or exchanged manifest.
-        facts: Names of facts that every folder of this kind has.
+        kind: Dataclass with the facts that a folder of this kind has. None: any facts.
     """
     path = folder / MANIFEST
     if not path.exists():
         return None
-    content = read_json(path, remedy)
-    known = isinstance(content, dict) and content.keys() == {"files", "facts", "checksum"}
-    if not known or content.pop("checksum") != digest(content):
-        raise DamagedFileError(f"{path} is damaged, or was written by another version of sts_jax: {remedy}.")
-    if missing := set(facts) - content["facts"].keys():
-        raise DamagedFileError(f"{path} is that of another folder (it has no {', '.join(sorted(missing))}): {remedy}.")
-    return Manifest(**content)
+    try:
+        content = decode(_Content, read_json(path, remedy), "content")
+        if content.checksum != digest({"files": content.files, "facts": content.facts}):
+            raise ValueError("its checksum differs")
+    except ValueError as error:
+        text = f"{path} is damaged, or was written by another version of sts_jax ({error}): {remedy}."
+        raise DamagedFileError(text) from None
+    if kind is not None:
+        try:
+            decode(kind, content.facts, "facts")
+        except ValueError as error:
+            raise DamagedFileError(f"{path} is that of another folder ({error}): {remedy}.") from None
+    return Manifest(content.files, content.facts)
 
 
 def verify(folder: Path, manifest: Manifest, remedy: str, names: Iterable[str] | None = None) -> None:
@@ -272,8 +297,14 @@ OWNER = ".lock-owner"  # file in a locked folder with the number of the process 
 
 
 @contextlib.contextmanager
-def lock(folder: Path) -> Iterator[None]:
+def lock(folder: Path, *, finished: bool = False) -> Iterator[None]:
     """Lock a folder for this process until the `with` block or the process ends. A missing folder is created.
+
+    What killed processes have left of unfinished writes is deleted.
+
+    Args:
+        finished: True if the results in the folder may be complete, so that nothing needs to be written. A folder on a
+            read-only file system is then not locked.
 
     Raises:
         LockedError: The folder is already locked, by another process or by this one.
@@ -293,13 +324,27 @@ def lock(folder: Path) -> Iterator[None]:
         raise LockedError(f"{folder} is in use by {holder}: {remedy}, or choose another folder.") from None
     except OSError as error:
         held.release()
+        if finished and error.errno in _FORBIDDEN and folder.is_dir():
+            yield
+            return
         raise OSError(f"cannot create or write to {folder}: {error}. Choose a folder you can write to.") from error
     try:
+        _delete_partial(folder)
         yield
     finally:
         with contextlib.suppress(OSError):  # the folder may have been deleted meanwhile
             owner.unlink(missing_ok=True)
         held.release()
+
+
+def _delete_partial(folder: Path) -> None:
+    """Delete unfinished files and folders, except in folders below that have a lock of their own."""
+    for path in list(folder.iterdir()):
+        is_folder = path.is_dir() and not path.is_symlink()
+        if path.name.startswith(".") and path.suffix == ".partial":
+            shutil.rmtree(path, ignore_errors=True) if is_folder else path.unlink(missing_ok=True)
+        elif is_folder and not (path / ".lock").exists():
+            _delete_partial(path)
 
 
 def flush_folder(folder: Path) -> None:

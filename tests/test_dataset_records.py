@@ -29,7 +29,7 @@ def test_frames_and_the_views_after_them_are_read_in_the_given_order(tmp_path):
         np.testing.assert_array_equal(written[[4, 0, 2]], read)
     read = records.read_views(path, np.array([7, 5]), resolution=(9, 7), total=8)
     np.testing.assert_array_equal(read, views[[2, 0]])
-    with pytest.raises(storage.DamagedFileError, match=r"it has 8 records instead of 5"):
+    with pytest.raises(storage.DamagedFileError, match=r"it has 8 records, but should have 5"):
         records.read_images(path, np.arange(5), resolution=(9, 7), total=5)
 
 

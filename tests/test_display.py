@@ -1,5 +1,6 @@
 """Figures of `show`, and files of `save` read with Pillow and NumPy."""
 
+import dataclasses
 import io
 
 import jax
@@ -34,14 +35,52 @@ def test_a_png_holds_both_streams_side_by_side(tmp_path):
 
 
 HIDDEN = sts.physics.Hidden(jnp.array([0.5]), jnp.array([1.0]), jnp.array([0.6]), jnp.array([[0.0, 0, 1]]))
-FIELDS = {name: jnp.full(1, float(k)) for k, name in enumerate(sts.physics.Trajectory._fields)}
-TRAJECTORY = sts.physics.Trajectory(**(FIELDS | {"hidden": HIDDEN}))
+FLOATS = {"time": (1, 2), "pose": (1, 2, 7), "velocity": (1, 2, 6), "wrench": (1, 2, 6), "gravity": (1, 2, 3)}
+FLOATS |= {"sunk": (1,), "condition": (1, 0)}
+TRAJECTORY = sts.physics.Trajectory(
+    **{name: jnp.full(shape, float(k)) for k, (name, shape) in enumerate(FLOATS.items())},
+    **{name: jnp.ones((1, 2), bool) for name in ("contact", "wall")},
+    **{name: jnp.full(1, k) for k, name in enumerate(("outcome", "touches", "body", "resampled"))},
+    settled=jnp.array([True]),
+    hidden=HIDDEN,
+)
 
 
 @pytest.mark.parametrize("thing", [FRAME, BODY, TRAJECTORY], ids=["frame", "body", "trajectory"])
 def test_a_loaded_npz_equals_the_saved_object(tmp_path, thing):
     sts.save(tmp_path / "thing.npz", thing)
     same(sts.load(tmp_path / "thing.npz"), thing)
+
+
+@pytest.mark.parametrize(
+    ("thing", "name", "change", "message"),
+    [
+        (FRAME, "visual", lambda x: x[1:], "array tactile is float32 of shape"),
+        (FRAME, "tactile", lambda x: x * np.nan, "array tactile has values that are not finite"),
+        (FRAME, "segmentation", lambda x: x + 0.5, "array segmentation is float64"),
+        (BODY, "hulls", lambda x: x + np.inf, "array hulls has values"),
+        (BODY, "faces", lambda x: x + 10**6, "faces has indices from"),
+        (TRAJECTORY, "hidden/fill", lambda x: np.zeros(2), "array hidden/fill .* must be Float of shape"),
+        (TRAJECTORY, "time", lambda x: np.zeros((1, 3)), "array pose is"),
+        (TRAJECTORY, "sunk", lambda x: np.array([np.nan]), "array sunk has"),
+    ],
+)
+def test_arrays_of_wrong_shapes_types_and_values_are_named(tmp_path, thing, name, change, message):
+    path = tmp_path / "a.npz"
+    sts.save(path, thing)
+    with np.load(path) as file:
+        arrays = dict(file)
+    np.savez(path, **(arrays | {name: change(arrays[name])}))
+    with pytest.raises(DamagedFileError, match=rf"a\.npz is damaged .*{message}"):
+        sts.load(path)
+
+
+def test_what_cannot_be_loaded_is_not_saved(tmp_path):
+    with pytest.raises(ValueError, match="array hulls has values that are not finite"):
+        sts.save(tmp_path / "a.npz", dataclasses.replace(BODY, hulls=BODY.hulls * jnp.nan))
+    unbalanced = dataclasses.replace(FRAME, pose=FRAME.pose * jnp.nan, balanced=jnp.array(False))
+    sts.save(tmp_path / "a.npz", unbalanced)  # as `sense` returns it for an invalid pose
+    same(sts.load(tmp_path / "a.npz"), unbalanced)
 
 
 def test_a_damaged_file_raises_an_error_unless_the_damage_is_outside_the_arrays(tmp_path):

@@ -103,8 +103,8 @@ def test_a_session_is_continued_and_its_trajectories_discarded_restored_and_conf
         (lambda folder: (Session(folder), Session(folder)), storage.LockedError, "is in use by .*: close what uses"),
         (
             lambda folder: (storage.write_manifest(folder, {}, {"shards": 3}), Session(folder)),
-            ValueError,
-            r"holds no session .*origin.camera is missing",
+            storage.DamagedFileError,
+            r"is that of another folder .*facts.camera is missing.*give the folder of a session",
         ),
     ],
 )

@@ -60,7 +60,7 @@ def test_a_folder_is_written_as_a_whole_or_not_at_all(tmp_path, monkeypatch):
     assert (tmp_path / "deep/a/one").read_bytes() == b"1"
 
 
-@pytest.mark.parametrize("content", [b"", b'{"seed"', b"\xff\xfe{}", b"1" * 5000])
+@pytest.mark.parametrize("content", [b"", b'{"seed"', b"\xff\xfe{}", b"1" * 5000, b"[" * 100_000])
 def test_damaged_json_is_named_with_the_remedy(tmp_path, content):
     path = tmp_path / "a.json"
     with pytest.raises(FileNotFoundError):
@@ -88,14 +88,46 @@ def test_other_settings_are_refused_and_equal_ones_are_not(tmp_path):
             storage.claim(path, content | change)
 
 
+@dataclasses.dataclass(frozen=True)
+class Facts:
+    step: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Noted(Facts):
+    note: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Named:
+    step: str
+
+
+@pytest.mark.parametrize(
+    "content",
+    [[], 3, None, {}, {"files": [], "facts": {}}, {"files": {"a": 1}, "facts": {}}, {"files": {}, "facts": 3}],
+)
+def test_a_manifest_with_absurd_content_and_a_valid_checksum_is_named(tmp_path, content):
+    if isinstance(content, dict):
+        content = {**content, "checksum": storage.digest(content)}
+    (tmp_path / storage.MANIFEST).write_text(json.dumps(content))
+    with pytest.raises(
+        storage.DamagedFileError, match=r"manifest\.json is damaged, or .*(content|files|facts).*: remedy"
+    ):
+        storage.read_manifest(tmp_path, "remedy")
+
+
 def test_each_mismatch_of_a_folder_with_its_manifest_is_named(tmp_path):
     for name in "ab":
         (tmp_path / name).write_text(name)
     assert storage.read_manifest(tmp_path, "remedy") is None
     manifest = storage.write_manifest(tmp_path, storage.checksums(tmp_path, "ab"), {"step": 3})
-    assert storage.read_manifest(tmp_path, "remedy") == storage.read_manifest(tmp_path, "remedy", "step") == manifest
-    with pytest.raises(storage.DamagedFileError, match=r"manifest\.json is that of another folder .*no note.*: remedy"):
-        storage.read_manifest(tmp_path, "remedy", "step", "note")
+    assert storage.read_manifest(tmp_path, "remedy") == storage.read_manifest(tmp_path, "remedy", Facts) == manifest
+    for kind, field in ((Noted, "note is missing"), (Named, "step is 3")):
+        with pytest.raises(
+            storage.DamagedFileError, match=rf"manifest\.json is that of another folder .*{field}.*: remedy"
+        ):
+            storage.read_manifest(tmp_path, "remedy", kind)
     storage.verify(tmp_path, manifest, "remedy")
     (tmp_path / "a").write_text("b")
     for names, message in ((None, "a is not the file"), (["b", "c"], "c is not listed in")):
@@ -190,3 +222,28 @@ def test_a_dataclass_is_the_same_after_json():
 def test_a_wrong_field_of_json_values_is_named(values, message):
     with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
         storage.decode(Outer, {"name": "a", "inner": {"size": [1, 2]}} | values, "outer")
+
+
+def test_what_kills_have_left_is_deleted_with_the_lock_that_protects_it(tmp_path):
+    leftovers = [".a.npz.7.partial", "figures/.b.png.1.partial", "models/one/.c.json.1.partial", "models/d.partial"]
+    for name in leftovers:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("half")
+    (tmp_path / ".pair.3.partial").mkdir()
+    (tmp_path / ".pair.3.partial/a.png").write_text("half")
+    with storage.lock(tmp_path / "models/one"):
+        (tmp_path / "models/one/.e.json.2.partial").write_text("being written")
+        with storage.lock(tmp_path):
+            left = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.partial")}
+    assert left == {"models/one/.e.json.2.partial", "models/d.partial"}
+
+
+def test_a_finished_folder_is_read_on_a_read_only_disk(tmp_path, monkeypatch):
+    def refused(*_):
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr("filelock.FileLock.acquire", refused)
+    with storage.lock(tmp_path, finished=True):
+        assert list(tmp_path.iterdir()) == []
+    with pytest.raises(OSError, match=r"cannot create or write to .*Choose a folder"), storage.lock(tmp_path):
+        pytest.fail("locked")

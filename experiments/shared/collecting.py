@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 import sts_jax as sts
-from experiments.shared import commissioning, drawing
+from experiments.shared import commissioning, drawing, interrupts
 from experiments.shared.device import FIELD_OF_VIEW, TwinConfig, make_twin
 from experiments.shared.page import CollectPage
 from experiments.shared.terminal import Bar, Terminal, say
@@ -92,6 +92,7 @@ def collect(config: Collect) -> None:
     with contextlib.ExitStack() as stack:
         prepare = of_twin if config.twin else of_device
         sensor, session, someone, empty = prepare(config, dataset, stack)
+        stack.enter_context(interrupts.in_order())
         before, begun_s = session.confirmed, time.monotonic()
         say(f"{dataset} has {before} confirmed trajectories. New ones are added")
         trusted, guide, note = config.automatic or config.twin, config.guide, config.note

@@ -1,5 +1,6 @@
 """Evaluates every model of an experiment with every subset of its inputs, and records what the results belong to."""
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -26,17 +27,25 @@ SEED = 20  # seed of the re-rolls
 Judge = Callable[[evaluation.Predicted, dataset.Pairs], evaluation.Scores]
 
 
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """A part of the results in a manifest: checksums of its inputs by name, and the names of its files."""
+
+    inputs: dict[str, str]
+    files: tuple[str, ...]
+
+
 def stale(folder: Path, part: str, inputs: Mapping[str, str]) -> str | None:
     """Why a part of the results of a folder must be computed again, given the checksums of its inputs, or None."""
     try:
         manifest = storage.read_manifest(folder, "it will be written again")
-        if manifest is None or part not in manifest.facts:
+        recorded = _parts(manifest).get(part)
+        if manifest is None or recorded is None:
             return f"{storage.MANIFEST} has no record of the {part}"
-        recorded = manifest.facts[part]
-        for name in {**recorded, **inputs}:
-            if recorded.get(name) != inputs.get(name):
+        for name in {**recorded.inputs, **inputs}:
+            if recorded.inputs.get(name) != inputs.get(name):
                 return f"{name} has changed since"
-        storage.verify(folder, manifest, "it will be written again")
+        storage.verify(folder, manifest, "it will be written again", recorded.files)
     except storage.DamagedFileError as error:
         return str(error)
     return None
@@ -44,12 +53,25 @@ def stale(folder: Path, part: str, inputs: Mapping[str, str]) -> str | None:
 
 def record(folder: Path, part: str, inputs: Mapping[str, str], files: Sequence[Path]) -> None:
     """Add the inputs and the files of a part of the results to the manifest of a folder. Call it after writing them."""
-    try:
-        before = storage.read_manifest(folder, "") or storage.Manifest({}, {})
-    except storage.DamagedFileError:
-        before = storage.Manifest({}, {})
-    sums = storage.checksums(folder, [file.relative_to(folder).as_posix() for file in files])
-    storage.write_manifest(folder, {**before.files, **sums}, {**before.facts, part: dict(inputs)})
+    before = None
+    with contextlib.suppress(storage.DamagedFileError):
+        before = storage.read_manifest(folder, "")
+    names = [file.relative_to(folder).as_posix() for file in files]
+    parts = {**_parts(before), part: Part(dict(inputs), tuple(names))}
+    sums = {**(before.files if before else {}), **storage.checksums(folder, names)}
+    kept = {name: sums[name] for one in parts.values() for name in one.files if name in sums}
+    storage.write_manifest(folder, kept, {name: dataclasses.asdict(one) for name, one in parts.items()})
+
+
+def _parts(manifest: storage.Manifest | None) -> dict[str, Part]:
+    """The parts of the results that a manifest records. Facts of other folders are left out."""
+    parts = {}
+    for name, fact in ({} if manifest is None else manifest.facts).items():
+        if not isinstance(fact, dict) or "files" not in fact:  # an older record, whose part has all files
+            fact = {"inputs": fact, "files": list(manifest.files)}
+        with contextlib.suppress(ValueError):
+            parts[name] = storage.decode(Part, fact, name)
+    return parts
 
 
 def identity(model: Path) -> str:
@@ -68,6 +90,7 @@ class SplitPairs(NamedTuple):
     validation: dataset.Pairs  # validation trajectories
     given: dataset.Pairs  # held-out trajectories, as inputs
     test: dataset.Pairs  # the same held-out trajectories, as targets
+    rows: Mapping[str, np.ndarray]  # indices of the trajectories in each part of the split
 
 
 def evaluate(run: Run, data: dataset.Dataset, own: Extensions = NONE) -> str:
@@ -148,7 +171,7 @@ def _pairs(run: Run, data: dataset.Dataset, own: Extensions) -> SplitPairs:
     test = dataset.reduced(given, size)
     if run.config.model == "paper":
         validation, given = dataset.reduced(validation, size), test
-    return SplitPairs(train, validation, given, test)
+    return SplitPairs(train, validation, given, test, rows)
 
 
 def _scored(
@@ -158,6 +181,7 @@ def _scored(
     config, state, jobs = run.config, run.config.model == "statespace", []
     for name in MODELS[config.model]:
         predictor = sts.Predictor.load(run.folder(name))
+        training.claim_split(run.folder(name), pairs.rows)
         for given, subset in evaluation.subsets(predictor.modalities, state=state).items():
             jobs.append((f"{TITLES[name]}, {given}", predictor, subset))
     blank = training.load_blank(run.folder(run.main_model))[0] / 255

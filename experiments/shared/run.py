@@ -126,7 +126,7 @@ def with_meshes(collection: dataset.Collection, folder: Path, args: Args) -> dat
     asked = args.classes or (collection.categories if "collection.categories" in args.given else ())
     taken = asked or tuple(name for name in classes if name in collection.categories) or classes
     path = args.workdir / "objects.txt"
-    with storage.lock(args.workdir):  # so that another run in this folder does not lose its listing
+    with storage.lock(args.workdir, finished=True):  # so that another run in this folder does not lose its listing
         meshes, listing = dataset.survey_meshes(
             folder,
             collection.scenario,
@@ -172,7 +172,7 @@ def main(config: Config, workdir: Path, *, only: Stage | None = None, own: Exten
     """
     check(config, own)
     sensor = sts.Sensor()
-    with storage.lock(workdir):
+    with storage.lock(workdir, finished=True):
         storage.claim(workdir / "config.json", dataclasses.asdict(config))
         folder = workdir / "dataset"
         data = collect(config.collection, sensor, folder) if only in (None, "collect") else dataset.load(folder)
@@ -257,6 +257,7 @@ def train(run: Run, data: dataset.Dataset, own: Extensions = NONE) -> None:
         own.measurements,
     ):
         folder = run.folder(job.name)
+        training.claim_split(folder, rows)
         train_model(job, folder, config.targets, own)
         if isinstance(job.model, statespace.Config):
             validation, scenario = data.pairs(rows["validation"]), config.collection.scenario

@@ -84,7 +84,7 @@ def main(args: Train) -> None:
     if args.only == "collect":
         return
     data = read(config, workdir)
-    with storage.lock(folder):
+    with storage.lock(folder, finished=True):
         storage.claim(folder / "config.json", {**dataclasses.asdict(config), "trajectories": data.identity})
         if args.only in (None, "train"):
             for job in jobs(config, data):

@@ -3,7 +3,6 @@
 import contextlib
 import os
 import select
-import signal
 import sys
 import time
 import warnings
@@ -12,6 +11,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from experiments.shared import interrupts
 from sts_jax import hardware
 from sts_jax.hardware import Action, Stage, View
 from sts_jax.storage import LockedError
@@ -67,7 +67,7 @@ class Bar:
 
 @contextlib.contextmanager
 def on_one_line(*, debug: bool = False) -> Iterator[None]:
-    """End the program with the line `error: ...` after an error that the user can correct, unless `debug` is set."""
+    """End the program with one line after Ctrl-C, or, unless `debug` is set, after an error that can be corrected."""
     usual, warnings.formatwarning = warnings.formatwarning, _note
     try:
         yield
@@ -75,21 +75,15 @@ def on_one_line(*, debug: bool = False) -> Iterator[None]:
         if debug:
             raise
         raise SystemExit(f"error: {error}") from None
+    except KeyboardInterrupt:
+        say(interrupts.LINE)
+        raise SystemExit(interrupts.CODE) from None
     finally:
         warnings.formatwarning = usual
 
 
 def _note(message: Warning | str, *_: Any, **__: Any) -> str:
     return f"note: {message}\n"
-
-
-def interrupt_on_sigterm() -> None:
-    """Make SIGTERM raise a `KeyboardInterrupt`, so that the process writes its files and ends as after Ctrl+C."""
-
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    signal.signal(signal.SIGTERM, interrupt)
 
 
 class Terminal:

@@ -59,7 +59,7 @@ def collect(
     sensor.check()
     collection.check()
     resampled, left_out = 0, []
-    with lock(folder):
+    with lock(folder, finished=True):
         manifest = records.manifest_of(folder)
         claim(folder / "collection.json", as_json(collection))
         claim(folder / "sensor.json", sensor.constants())

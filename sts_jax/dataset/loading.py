@@ -5,15 +5,18 @@ import dataclasses
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import numpy as np
+import pydantic
+from jaxtyping import Float, Int
 
-from sts_jax import geometry
+from sts_jax import geometry, physics
+from sts_jax._checked import check_arrays
 from sts_jax.dataset import records
 from sts_jax.dataset.measurement import Measurement, measured
-from sts_jax.storage import digest, read_arrays, read_json, verify
+from sts_jax.storage import DamagedFileError, Finite, decode, digest, read_arrays, read_fields, read_json, verify
 
 
 class Pairs(NamedTuple):
@@ -276,16 +279,16 @@ def load(folder: str | Path) -> Dataset:
             f"{folder / name} is missing: the collection is not finished. Call `collect` to continue it."
         )
     verify(folder, manifest, records.remedy(folder))
-    parts = [read_arrays(folder / table, records.remedy(folder)) for _, table in files]
+    collection, split = _descriptions(folder)
+    parts = [_table(folder / table, collection["num_objects"]) for _, table in files]
     starts = np.cumsum([0] + [len(part["trajectory/outcome"]) for part in parts])
     leaves = {key: np.concatenate([part[key] for part in parts]) for key in parts[0] if key != "frames"}
     sizes = [len(part["frames"]) for part in parts]
     views = [len(part["view/body"]) for part in parts]
-    split = read_json(folder / "split.json", records.remedy(folder))
     return Dataset(
-        collection=read_json(folder / "collection.json", records.remedy(folder)),
+        collection=collection,
         identity=digest(manifest._asdict()),
-        split={name: np.array(part, np.int64) for name, part in split.items()},
+        split=split,
         **{
             group: {k.split("/")[1]: v for k, v in leaves.items() if k.startswith(f"{group}/")}
             for group in ("trajectory", "hidden", "solid", "view")
@@ -297,3 +300,95 @@ def load(folder: str | Path) -> Dataset:
         view_shard_of=np.repeat(np.arange(count), views),
         view_record_of=np.concatenate([size + np.arange(k) for size, k in zip(sizes, views, strict=True)]),
     )
+
+
+class _Solid(NamedTuple):
+    support: Float[np.ndarray, "n 128"]
+    mass: Float[np.ndarray, "n"]
+    com: Float[np.ndarray, "n 3"]
+
+
+class _Table(NamedTuple):
+    """The arrays of the trajectories of a shard."""
+
+    trajectory: physics.Trajectory
+    solid: _Solid
+
+
+class _ViewTable(NamedTuple):
+    """The arrays of the views of a shard."""
+
+    pose: Float[np.ndarray, "n 7"]
+    body: Int[np.ndarray, "n"]
+    support: Float[np.ndarray, "n 128"]
+    mass: Float[np.ndarray, "n"]
+    com: Float[np.ndarray, "n 3"]
+
+
+def _table(path: Path, num_objects: int) -> dict[str, np.ndarray]:
+    """Read and check the arrays of a shard."""
+    arrays = read_arrays(path, records.remedy(path.parent))
+    groups: dict[str, dict[str, np.ndarray]] = {"trajectory": {}, "view": {}}
+    for name, values in arrays.items():
+        group = "view" if name.startswith("view/") else "trajectory"
+        if "/" in name:
+            groups[group][name.removeprefix("view/").replace("hidden/", "trajectory/hidden/")] = values
+    try:
+        check_arrays(_Table, groups["trajectory"])
+        check_arrays(_ViewTable, groups["view"])
+        shape = arrays["trajectory/time"].shape
+        for name, limits in (
+            ("trajectory/body", num_objects),
+            ("view/body", num_objects),
+            ("frames", np.array(shape)),
+        ):
+            values = arrays[name]
+            if values.dtype.kind not in "iu" or ((values < 0) | (values >= limits)).any():
+                raise ValueError(f"array {name} has values that are no indices below {limits}")
+    except (KeyError, ValueError) as error:
+        raise DamagedFileError(
+            f"{path} is not the table of a shard ({error}): {records.remedy(path.parent)}."
+        ) from None
+    return arrays
+
+
+_Count = Annotated[int, pydantic.Field(ge=1)]
+_Indices = tuple[Annotated[int, pydantic.Field(ge=0)], ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Collection:
+    """The fields of `collection.json` that are read."""
+
+    num_objects: _Count
+    resolution: tuple[_Count, _Count]
+    shares: tuple[Finite, Finite, Finite]
+    seed: int
+    crop: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class _Split:
+    """The content of `split.json`."""
+
+    train: _Indices
+    validation: _Indices
+    test: _Indices
+
+
+def _descriptions(folder: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Read and check `collection.json` and `split.json`."""
+    remedy, path = records.remedy(folder), folder / "collection.json"
+    collection = read_json(path, remedy)
+    names = [field.name for field in dataclasses.fields(_Collection)]
+    try:
+        read = decode(_Collection, {name: collection[name] for name in names if name in collection}, "collection")
+    except ValueError as error:
+        raise DamagedFileError(f"{path} does not describe a dataset ({error}): {remedy}.") from None
+    split = dataclasses.asdict(read_fields(_Split, folder / "split.json", remedy))
+    members = [index for part in split.values() for index in part]
+    if len(set(members)) != len(members) or max(members, default=0) >= read.num_objects:
+        raise DamagedFileError(
+            f"{folder / 'split.json'} has an object in two parts, or one >= {read.num_objects}: {remedy}."
+        )
+    return collection, {name: np.array(part, np.int64) for name, part in split.items()}

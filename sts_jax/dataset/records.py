@@ -8,11 +8,13 @@ that order, and then one record per view. `NAME.npz` has all other data of the s
 missing.
 """
 
+import dataclasses
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+import pydantic
 from array_record.python.array_record_module import ArrayRecordReader, ArrayRecordWriter
 
 from sts_jax.storage import MANIFEST, DamagedFileError, Manifest, read_json, read_manifest, write_whole
@@ -21,6 +23,13 @@ FORMAT = 6  # format of a dataset's files, incremented when older files can no l
 DESCRIPTIONS = ("collection.json", "sensor.json", "split.json")
 # One record per group, because a read decompresses the whole group.
 WRITER_OPTIONS = "group_size:1,zstd:3"
+
+
+@dataclasses.dataclass(frozen=True)
+class _Facts:
+    """The facts in the manifest of a dataset."""
+
+    shards: Annotated[int, pydantic.Field(ge=1)]
 
 
 class Images(NamedTuple):
@@ -56,7 +65,7 @@ def manifest_of(folder: Path) -> Manifest | None:
                 f"{path} is of a dataset of format {written!r}, but this version of sts_jax reads format {FORMAT}: "
                 "collect into another folder, or read this one with the version that wrote it."
             )
-    manifest = read_manifest(folder, f"restore it, or collect into another folder than {folder}", "shards")
+    manifest = read_manifest(folder, f"restore it, or collect into another folder than {folder}", _Facts)
     if manifest is None and any(folder.glob("shard-*")):
         raise DamagedFileError(
             f"{folder / MANIFEST} is missing, but {folder} has shards: restore it, or collect into another folder."
@@ -95,7 +104,7 @@ def read_images(path: Path, indices: np.ndarray, *, resolution: tuple[int, int],
     """
     height, width = resolution
     size = height * width * 3
-    data = _read_records(path, indices, total)
+    data = _read_records(path, indices, total, 2 * size + -(-height * width // 8))
     return Images(
         visual=data[:, :size].reshape(-1, height, width, 3),
         tactile=data[:, size : 2 * size].reshape(-1, height, width, 3),
@@ -107,10 +116,10 @@ def read_images(path: Path, indices: np.ndarray, *, resolution: tuple[int, int],
 
 def read_views(path: Path, indices: np.ndarray, *, resolution: tuple[int, int], total: int) -> np.ndarray:
     """Read some views of a shard as uint8 `(n, height, width, 3)`. The arguments are those of `read_images`."""
-    return _read_records(path, indices, total).reshape(-1, *resolution, 3)
+    return _read_records(path, indices, total, 3 * resolution[0] * resolution[1]).reshape(-1, *resolution, 3)
 
 
-def _read_records(path: Path, indices: np.ndarray, total: int) -> np.ndarray:
+def _read_records(path: Path, indices: np.ndarray, total: int, length: int) -> np.ndarray:
     """Read some records of equal length, `uint8 (n, length)`."""
     if not path.is_file():
         raise FileNotFoundError(f"{path} is missing: {remedy(path.parent)}.")
@@ -121,6 +130,9 @@ def _read_records(path: Path, indices: np.ndarray, total: int) -> np.ndarray:
         reader.close()
     except (RuntimeError, ValueError, IndexError) as error:
         raise DamagedFileError(f"{path} is damaged ({error}): {remedy(path.parent)}.") from error
-    if count != total:
-        raise DamagedFileError(f"{path} is damaged: it has {count} records instead of {total}: {remedy(path.parent)}.")
+    if count != total or any(len(record) != length for record in records):
+        raise DamagedFileError(
+            f"{path} is damaged: it has {count} records, but should have {total} of {length} bytes: "
+            f"{remedy(path.parent)}."
+        )
     return np.frombuffer(b"".join(records), np.uint8).reshape(len(records), -1)

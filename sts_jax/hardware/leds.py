@@ -17,6 +17,7 @@ from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
 from sts_jax.hardware import protocol
+from sts_jax.storage import Finite
 
 READ_S = 0.02  # longest wait of one read (s)
 WRITE_S = 0.2  # longest wait of one write (s)
@@ -53,8 +54,8 @@ class Lit:
     levels: protocol.Levels  # duty cycles of the four light channels, 0 to 255
     counter: int  # number of changes of the levels since the controller booted
     boot: int  # number of the controller's boot, 0 to 65535. The controller counts its boots
-    sent_s: float  # time just before the request was first sent (s)
-    acknowledged_s: float  # time at which the answer had arrived (s)
+    sent_s: Finite  # time just before the request was first sent (s)
+    acknowledged_s: Finite  # time at which the answer had arrived (s)
 
     def unchanged_since(self, earlier: "Lit") -> bool:
         """Return True if the levels of the lights did not change between an earlier answer and this one."""

@@ -46,6 +46,14 @@ _LATE_S = 0.25
 _NO_IMAGE = np.zeros((0, 0, 3), np.uint8)
 
 
+@dataclasses.dataclass(frozen=True)
+class _Facts:
+    """The facts in the manifest of a recording."""
+
+    encoding: Encoding
+    origin: Origin
+
+
 class Recorder:
     """Writes the images of a sensor to a folder. `Replay` plays the recording back.
 
@@ -95,7 +103,8 @@ class Recorder:
             frame = av.VideoFrame.from_ndarray(shot.image, format="rgb24").reformat(format=video.pix_fmt)
             frame.pts = round(1000 * (shot.time_s - self._start_s))
             container.mux(video.encode(frame))
-            self._lines.write((json.dumps({"stream": shot.stream, **shot_facts(shot)}) + "\n").encode())
+            facts = {"stream": shot.stream, **shot_facts(shot)}
+            self._lines.write((json.dumps({**facts, "checksum": storage.digest(facts)}) + "\n").encode())
         except OSError as error:
             self._end()
             raise OSError(
@@ -227,18 +236,23 @@ class Replay:
 
 def _recorded(folder: Path) -> list[Shot]:
     """The images of a recording, without their pixels."""
-    manifest = storage.read_manifest(folder, _AGAIN)
-    if manifest is None or "encoding" not in manifest.facts:
+    manifest = storage.read_manifest(folder, _AGAIN, _Facts)
+    if manifest is None:
         raise FileNotFoundError(f"{folder} holds no recording: give the folder of a recording.")
     storage.verify(folder, manifest, _AGAIN)
     # An interrupted program leaves an incomplete last line, and lines whose images are not in the videos yet.
-    left = {stream: _count(folder / f"{stream}.mkv") for stream in ("visual", "tactile")}
+    size = manifest.facts["origin"]["width"], manifest.facts["origin"]["height"]
+    left = {stream: _count(folder / f"{stream}.mkv", size) for stream in ("visual", "tactile")}
     stills = []
     for number, line in enumerate((folder / FRAMES).read_bytes().split(b"\n")[:-1], 1):
         try:
-            facts = json.loads(line)
-            still = shot_of(_NO_IMAGE, facts["stream"], facts)
-        except (ValueError, KeyError, TypeError) as error:
+            facts = dict(json.loads(line))
+            checksum, stream = facts.pop("checksum", None), facts["stream"]  # older recordings have no checksum
+            if checksum not in (None, storage.digest(facts)) or stream not in ("visual", "tactile"):
+                raise ValueError(f"its checksum differs, or {stream!r} is no stream")
+            del facts["stream"]
+            still = shot_of(_NO_IMAGE, stream, facts)
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise DamagedFileError(f"{folder / FRAMES}, line {number}, is damaged ({error}): {_AGAIN}.") from error
         left[still.stream] -= 1
         if left[still.stream] >= 0:
@@ -246,10 +260,13 @@ def _recorded(folder: Path) -> list[Shot]:
     return stills
 
 
-def _count(path: Path) -> int:
+def _count(path: Path, size: tuple[int, int]) -> int:
     """The number of frames of a video, whose program may have been interrupted before the first frame."""
     try:
         with av.open(str(path)) as container:
+            video = container.streams.video[0]
+            if (video.width, video.height) != size:
+                raise DamagedFileError(f"{path} has {video.width} x {video.height} pixels, not {size}: {_AGAIN}.")
             return sum(packet.size > 0 for packet in container.demux(video=0))
     except (FileNotFoundError, EOFError):
         return 0

@@ -19,13 +19,13 @@ from sts_jax import storage
 from sts_jax.hardware.camera import CameraConfig, public
 from sts_jax.hardware.lens import Lens
 from sts_jax.sensor import Sensor
+from sts_jax.storage import Finite
 
 NAME = "sensor.json"  # name of the sensor file in a folder
 BACKGROUNDS = "background_visual.png", "background_tactile.png"  # raw images of the empty pad, lights off and on
 
 _AGAIN = "copy its whole folder again, or run `python -m experiments.commission` again"
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Settling = Annotated[float, Field(gt=0, lt=60)]
 Level = Annotated[int, Field(ge=0, le=255)]
@@ -104,7 +104,8 @@ class Device:
         """Read the device from a sensor file or its folder, and compare all files with the manifest."""
         file = sensor_file(path)
         checksums(file)
-        device = storage.read_json(file, _AGAIN).get("device")
+        content = storage.read_json(file, _AGAIN)
+        device = content.get("device") if isinstance(content, dict) else None
         if device is None:
             raise ValueError(f"{file} describes no device, but a simulated sensor: {_AGAIN}.")
         try:
@@ -118,6 +119,10 @@ class Device:
         if not set(BACKGROUNDS) <= checksums(file).keys():
             return None
         visual, tactile = (np.asarray(Image.open(file.with_name(name))) for name in BACKGROUNDS)
+        for name, image in zip(BACKGROUNDS, (visual, tactile), strict=True):
+            if image.shape != (self.lens.height, self.lens.width, 3):
+                size = f"{self.lens.width} x {self.lens.height}"
+                raise ValueError(f"{file.with_name(name)} is no RGB image of {size} pixels: {_AGAIN}.")
         return visual, tactile
 
     def check_identity(self, *, camera: str | None = None, leds: str | None = None) -> None:

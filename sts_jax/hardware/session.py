@@ -29,7 +29,7 @@ from sts_jax import storage
 from sts_jax.hardware import protocol
 from sts_jax.hardware.leds import Lit
 from sts_jax.hardware.sts import STS, Pair, Shot, Stream
-from sts_jax.storage import MANIFEST, DamagedFileError
+from sts_jax.storage import MANIFEST, DamagedFileError, Finite
 
 _TRAJECTORIES, _DISCARDED = "trajectories", "discarded"
 _STREAMS: tuple[Stream, Stream] = ("visual", "tactile")
@@ -58,6 +58,39 @@ class Origin:
         """The identity of a connected sensor. Reads one frame to find the image size."""
         height, width = sensor.camera.async_read().image.shape[:2]
         return cls(_name(sensor.camera.source), sensor.leds.serial_number, width, height, sensor.levels)
+
+
+@dataclasses.dataclass(frozen=True)
+class _ShotFacts:
+    """The values of `shot_facts`."""
+
+    taken: str
+    time_s: Finite
+    sequence: int
+    epoch: int
+    before: Lit
+    until_s: Finite
+
+    def __post_init__(self) -> None:
+        datetime.datetime.fromisoformat(self.taken)
+
+
+@dataclasses.dataclass(frozen=True)
+class _PairFacts:
+    """The facts in the manifest of a pair."""
+
+    visual: _ShotFacts
+    tactile: _ShotFacts
+
+
+@dataclasses.dataclass(frozen=True)
+class _Confirmation:
+    """The facts in the manifest of a confirmed trajectory."""
+
+    number: int
+    origin: str
+    confirmed: str
+    note: str
 
 
 def _name(source: str) -> str:
@@ -146,7 +179,7 @@ class Session:
         path = _trajectory(self.folder, number)
         files = {}
         for end in _ENDS:
-            pair = storage.read_manifest(path / end, _remedy(number))
+            pair = storage.read_manifest(path / end, _remedy(number), _PairFacts)
             if pair is None:
                 raise FileNotFoundError(
                     f"trajectory {number} cannot be confirmed, because it has no {end} pair of images ({path / end}): "
@@ -185,7 +218,7 @@ class Session:
 
 
 def _prepare(folder: Path, origin: Origin | None) -> Origin:
-    """Write the manifest of a session, or compare it, and remove what a killed process has left."""
+    """Write the manifest of a session, or compare it."""
     if origin is not None and not (folder / MANIFEST).exists():
         storage.write_manifest(folder, {}, dataclasses.asdict(origin))
     recorded = _read_origin(folder)
@@ -197,20 +230,15 @@ def _prepare(folder: Path, origin: Origin | None) -> Origin:
         )
     for kind in (_TRAJECTORIES, _DISCARDED):
         (folder / kind).mkdir(exist_ok=True)
-    for rest in (*folder.glob(".*.partial"), *folder.glob(f"{_TRAJECTORIES}/*/.*.partial")):
-        shutil.rmtree(rest) if rest.is_dir() else rest.unlink()
     storage.flush_folder(folder)
     return recorded
 
 
 def _read_origin(folder: Path) -> Origin:
-    manifest = storage.read_manifest(folder, "restore it from a backup")
+    manifest = storage.read_manifest(folder, "restore it from a backup, or give the folder of a session", Origin)
     if manifest is None:
         raise FileNotFoundError(f"{folder} holds no session ({MANIFEST} is missing): give the folder of a session.")
-    try:
-        return storage.decode(Origin, manifest.facts, "origin")
-    except ValueError as error:
-        raise ValueError(f"{folder} holds no session ({error}): give the folder of a session.") from error
+    return storage.decode(Origin, manifest.facts, "origin")
 
 
 def _trajectory(folder: Path, number: int, kind: str = _TRAJECTORIES) -> Path:
@@ -249,9 +277,9 @@ def list_recordings(folder: str | os.PathLike) -> list[Entry]:
 def _entry(path: Path, number: int, *, discarded: bool) -> Entry:
     taken, note = None, ""
     with contextlib.suppress(OSError):  # reading the trajectory later raises an error that names a damaged file
-        if (initial := storage.read_manifest(path / "initial", "", "visual")) is not None:
+        if (initial := storage.read_manifest(path / "initial", "", _PairFacts)) is not None:
             taken = initial.facts["visual"]["taken"]
-        if (confirmation := storage.read_manifest(path, "", "note")) is not None:
+        if (confirmation := storage.read_manifest(path, "", _Confirmation)) is not None:
             note = confirmation.facts["note"]
     standing: Standing = "discarded"
     if not discarded:
@@ -296,17 +324,18 @@ class Recordings:
     def __getitem__(self, index: int) -> RecordedTrajectory:
         number = self.numbers[index]
         path, remedy = _trajectory(self.folder, number), _remedy(number)
-        manifest = storage.read_manifest(path, remedy)
+        manifest = storage.read_manifest(path, remedy, _Confirmation)
         if manifest is None:
             raise FileNotFoundError(f"trajectory {number} of {self.folder} is not confirmed any more: load it again.")
         facts = manifest.facts
-        if (facts.get("number"), facts.get("origin")) != (number, storage.digest(dataclasses.asdict(self.origin))):
+        if (facts["number"], facts["origin"]) != (number, storage.digest(dataclasses.asdict(self.origin))):
             raise DamagedFileError(
-                f"{path} belongs to trajectory {facts.get('number')} or to a session of another sensor: move it back, "
+                f"{path} belongs to trajectory {facts['number']} or to a session of another sensor: move it back, "
                 f"or discard trajectory {number}."
             )
         storage.verify(path, manifest, remedy)
-        initial, final = (_read_pair(path / end, remedy) for end in _ENDS)
+        size = self.origin.height, self.origin.width
+        initial, final = (_read_pair(path / end, size, remedy) for end in _ENDS)
         return RecordedTrajectory(number, initial, final, facts["note"])
 
     def images(
@@ -334,12 +363,15 @@ class Recordings:
         return RecordedImages(np.array(visual), np.array(tactile), np.array(self.numbers))
 
 
-def _read_pair(path: Path, remedy: str) -> Pair:
-    manifest = storage.read_manifest(path, remedy)
+def _read_pair(path: Path, size: tuple[int, int], remedy: str) -> Pair:
+    manifest = storage.read_manifest(path, remedy, _PairFacts)
     assert manifest is not None  # the manifest of the trajectory lists it
     shots = []
     for stream in _STREAMS:
-        image = cv2.cvtColor(cv2.imread(str(path / f"{stream}.png"), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+        decoded = cv2.imread(str(path / f"{stream}.png"), cv2.IMREAD_COLOR)
+        if decoded is None or decoded.shape[:2] != size:
+            raise DamagedFileError(f"{path / f'{stream}.png'} is no image of {size[1]} x {size[0]} pixels: {remedy}.")
+        image = cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB)
         image.flags.writeable = False
         shots.append(shot_of(image, stream, manifest.facts[stream]))
     return Pair(*shots)
@@ -368,5 +400,5 @@ def shot_facts(shot: Shot) -> dict[str, Any]:
 
 def shot_of(image: Image, stream: Stream, facts: dict[str, Any]) -> Shot:
     """The image with the values that `shot_facts` returned."""
-    before = storage.decode(Lit, facts["before"], "before")
-    return Shot(image, stream, facts["time_s"], facts["sequence"], facts["epoch"], before, facts["until_s"])
+    read = storage.decode(_ShotFacts, facts, stream)
+    return Shot(image, stream, read.time_s, read.sequence, read.epoch, read.before, read.until_s)

@@ -7,19 +7,24 @@
 import contextlib
 import http.server
 import ipaddress
+import socket
+import threading
 import urllib.parse
 from typing import Any
 
-_TIMEOUT_S = 10.0  # longest wait for a client that sends or reads nothing (s)
+_TIMEOUT_S = 10.0  # longest time of a request, and longest wait for a client that does not read its answer (s)
+_MOST = 64  # largest number of connections at a time. One open page has about six
 
 
 class Server(http.server.ThreadingHTTPServer):
     """A server with a thread per connection. A client that goes away leaves no trace."""
 
     daemon_threads = True
+    request_queue_size = _MOST
 
     def __init__(self, host: str, port: int, handler: type["Handler"]):
-        """Listen on an address. Port 0 selects a free one."""
+        """Listen on an address, by default on all addresses of this computer. Port 0 selects a free one."""
+        host, self._free = host or "0.0.0.0", threading.Semaphore(_MOST)
         try:
             super().__init__((host, port), handler)
         except (OSError, OverflowError) as error:
@@ -41,12 +46,40 @@ class Server(http.server.ThreadingHTTPServer):
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Print nothing: an error of a connection concerns its client only."""
 
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answer in a thread, or close the connection if there are too many."""
+        if self._free.acquire(blocking=False):
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Answer the requests of a connection."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._free.release()
+
 
 class Handler(http.server.BaseHTTPRequestHandler):
     """Base of the answers. A subclass defines `do_GET` and `do_POST`, which see only requests that are not foreign."""
 
     server: Server
     timeout = _TIMEOUT_S
+
+    def handle(self) -> None:
+        """Answer a request, unless the client takes too long to send it."""
+        limit = threading.Timer(self.timeout, self._stop_reading)
+        limit.daemon = True
+        limit.start()
+        try:
+            super().handle()
+        finally:
+            limit.cancel()
+
+    def _stop_reading(self) -> None:
+        with contextlib.suppress(OSError):  # the client has gone
+            self.connection.shutdown(socket.SHUT_RD)
 
     def parse_request(self) -> bool:
         """Refuse a request that names another host, or that a page of another site has sent."""
@@ -89,7 +122,7 @@ class Handler(http.server.BaseHTTPRequestHandler):
         name = ""
         with contextlib.suppress(ValueError):
             name = urllib.parse.urlsplit("//" + host).hostname or ""
-        if name == self.server.host or (self.server.is_local and name in ("localhost", "127.0.0.1", "::1")):
+        if name in ("localhost", self.server.host.lower()) or (self.server.is_local and name in ("127.0.0.1", "::1")):
             return True
         with contextlib.suppress(ValueError):  # a server on 0.0.0.0 has all addresses of this computer
             return self.server.host in ("0.0.0.0", "::") and bool(ipaddress.ip_address(name))

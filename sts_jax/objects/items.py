@@ -3,16 +3,16 @@
 import dataclasses
 import hashlib
 import json
-import zipfile
 from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
+from sts_jax._checked import check_arrays
 from sts_jax.objects.body import FACE_CLASSES, HULL_CLASSES, PART_CLASSES, TEXTURE_CLASSES, Body
 from sts_jax.objects.formats import references
-from sts_jax.storage import write_arrays
+from sts_jax.storage import decode, write_arrays
 
 LARGEST = 0.12  # m, larger objects are scaled down to this longest side, so that they can lie on the pad of 0.15 m
 NUM_FACES = 4096  # the largest size class whose rendering is cheap, larger meshes are decimated
@@ -59,6 +59,15 @@ class Entry:
     length: float  # Longest side before a larger object was scaled down (m).
 
 
+@dataclasses.dataclass(frozen=True)
+class _About:
+    """What a file of the cache says of a body beside its arrays."""
+
+    gaps: tuple[float, float]
+    notes: tuple[str, ...]
+    length: float
+
+
 def cache_path(library: Library, item: Item) -> Path:
     """Path of an item's body in the cache: a hash of the mesh file, the files to which it refers, and all settings."""
     assert library.cache is not None
@@ -88,8 +97,11 @@ def read_cached(path: Path, item: Item) -> Entry | None:
     """Read the body of an item from a file of the cache. None if the file is missing or damaged."""
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
-            body = Body(**{field.name: jnp.asarray(data[field.name]) for field in dataclasses.fields(Body)})
-            about = json.loads(data["about"].tobytes())
-        return Entry(item, body, tuple(about["gaps"]), tuple(about["notes"]), float(about["length"]))
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            arrays = dict(data)
+        about = decode(_About, json.loads(arrays.pop("about").tobytes()), "about")
+        check_arrays(Body, arrays)
+        body = Body(**{name: jnp.asarray(array) for name, array in arrays.items()})
+        body.check()
+        return Entry(item, body, about.gaps, about.notes, about.length)
+    except Exception:  # a damaged zip file raises exceptions of many types
         return None

@@ -12,6 +12,7 @@ from sts_jax.training.arrays import state_model as state_model
 from sts_jax.training.folder import Model as Model
 from sts_jax.training.folder import TrainState as TrainState
 from sts_jax.training.folder import calibrate as calibrate
+from sts_jax.training.folder import claim_split as claim_split
 from sts_jax.training.folder import load as load
 from sts_jax.training.folder import load_blank as load_blank
 from sts_jax.training.folder import records as records

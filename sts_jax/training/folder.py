@@ -14,26 +14,29 @@ resumed training makes them again.
 """
 
 import contextlib
+import dataclasses
 import hashlib
 import io
 import json
 import logging
 import os
 import shutil
+import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+import pydantic
 from flax import nnx
 from jaxtyping import Array, ArrayLike, Int, UInt8
 from orbax.checkpoint import v1 as ocp
 
 from sts_jax import mvae, statespace, storage
-from sts_jax._checked import checked
+from sts_jax._checked import check_arrays, checked
 from sts_jax.training.arrays import Arrays, Config, check
 
 CONFIG, BLANK, CALIBRATION, LOG = "config.json", "blank.npz", "calibration.json", "metrics.jsonl"
@@ -56,6 +59,11 @@ class TrainState(NamedTuple):
     step: Int[Array, ""]  # gradient steps done
 
 
+class _Blank(NamedTuple):
+    visual: UInt8[np.ndarray, "height width 3"]
+    tactile: UInt8[np.ndarray, "height width 3"]
+
+
 class Model(NamedTuple):
     """A trained model. `graphdef` and `state` are the first two arguments of `mvae.predict` or `statespace.sample`."""
 
@@ -75,9 +83,55 @@ class Model(NamedTuple):
         return f"Model({parts}, condition={config.condition}, {count:,} numbers, step={self.step})"
 
 
+_Number = Annotated[int, pydantic.Field(ge=0)]
+_Positive = Annotated[float, pydantic.Field(gt=0, allow_inf_nan=False)]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Log:
+    """The part of the training log up to the current checkpoint."""
+
+    bytes: _Number
+    sha256: str
+
+
+@dataclasses.dataclass(frozen=True)
+class _Facts:
+    """The facts in the manifest of a model."""
+
+    step: _Number | None  # step of the current checkpoint
+    log: _Log | None = None
+    split: str | None = None  # checksum of the split of the dataset, see `claim_split`
+
+
+@dataclasses.dataclass(frozen=True)
+class _Record:
+    """A line of the training log."""
+
+    terms: Record
+
+
+@dataclasses.dataclass(frozen=True)
+class _Subset:
+    """The numbers of `statespace.Calibration` for one subset of the inputs."""
+
+    outcome: _Positive
+    weight: _Positive
+    variance: _Positive
+    contrast: _Positive
+
+
+@dataclasses.dataclass(frozen=True)
+class _CalibrationFile:
+    """The content of `calibration.json`."""
+
+    data: int | None
+    subsets: dict[str, _Subset]
+
+
 def manifest(folder: Path) -> storage.Manifest | None:
     """Read the manifest of a model's folder. None before the first checkpoint."""
-    listed = storage.read_manifest(folder, _remedy(folder), "step")
+    listed = storage.read_manifest(folder, _remedy(folder), _Facts)
     if listed is None and any((folder / "checkpoints").glob("[0-9]*")):
         raise storage.DamagedFileError(f"{folder} has a checkpoint but no {storage.MANIFEST}: {_remedy(folder)}.")
     return listed
@@ -125,7 +179,7 @@ def save(folder: Path, state: TrainState, *, compact: bool = False) -> None:
         beside = [name for name in (CONFIG, BLANK) if (folder / name).exists()]
         known = {name: before.files[name] for name in beside if name in before.files}
         new = [name for name in beside if name not in known] + _files(folder, step)
-        facts: dict[str, Any] = {"step": step}
+        facts: dict[str, Any] = {**before.facts, "step": step}
         if log := _logged(folder, before, whole=True):
             facts["log"] = {"bytes": len(log), "sha256": hashlib.sha256(log).hexdigest()}
         storage.write_manifest(folder, known | storage.checksums(folder, new), facts)
@@ -169,7 +223,33 @@ def read(folder: Path, step: int, like: TrainState) -> TrainState:
 def records(folder: Path) -> list[Record]:
     """Read the training log of a model up to the current checkpoint, after comparing it with the manifest."""
     listed = manifest(folder)
-    return [] if listed is None else [json.loads(line) for line in _logged(folder, listed).splitlines()]
+    lines = [] if listed is None else _logged(folder, listed).splitlines()
+    try:
+        some = [storage.decode(_Record, {"terms": json.loads(line)}, "record").terms for line in lines]
+        if any("step" not in record for record in some):
+            raise ValueError("field record.step is missing")
+    except (ValueError, RecursionError) as error:
+        raise storage.DamagedFileError(f"{folder / LOG} is no training log ({error}): {_remedy(folder)}.") from None
+    return some
+
+
+def claim_split(folder: Path, split: Mapping[str, ArrayLike]) -> None:
+    """Record the split of the dataset in the manifest of a model, or compare it with that of its training.
+
+    Call it before the training, and before the model is scored, so that this never happens on its training data.
+
+    Args:
+        split: Indices of the objects or trajectories in each part, such as `train`.
+    """
+    listed = manifest(folder) or storage.Manifest({}, {"step": None})
+    checksum = storage.digest({name: np.asarray(part).tolist() for name, part in split.items()})
+    if listed.facts["step"] is None:
+        storage.write_manifest(folder, listed.files, {**listed.facts, "split": checksum})
+    elif listed.facts.get("split", checksum) != checksum:
+        raise ValueError(
+            f"{folder} was trained with another split of the dataset into training and test data: restore its "
+            f"split.json, or delete {folder} and train again"
+        )
 
 
 def append(folder: Path, record: Record) -> None:
@@ -187,7 +267,7 @@ def resume_log(folder: Path) -> list[Record]:
 
 def _logged(folder: Path, listed: storage.Manifest, *, whole: bool = False) -> bytes:
     """The log up to the checkpoint of a manifest, or the whole log, compared with the manifest."""
-    path, fact = folder / LOG, listed.facts.get("log", {"bytes": 0})
+    path, fact = folder / LOG, listed.facts.get("log") or {"bytes": 0}
     content = path.read_bytes() if path.exists() else b""
     known = content[: fact["bytes"]]
     if len(known) < fact["bytes"] or (known and hashlib.sha256(known).hexdigest() != fact["sha256"]):
@@ -216,6 +296,12 @@ def load_blank(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     if listed is not None and listed.facts["step"] is not None:
         storage.verify(folder, listed, _remedy(folder), [BLANK])
     images = storage.read_arrays(path, _remedy(folder))
+    try:
+        check_arrays(_Blank, images)
+    except ValueError as error:
+        raise storage.DamagedFileError(
+            f"{path} has no images of the empty sensor ({error}): {_remedy(folder)}."
+        ) from None
     return images["visual"], images["tactile"]
 
 
@@ -247,11 +333,17 @@ def read_calibration(folder: Path) -> tuple[statespace.Calibration, int | None] 
     remedy = "restore it from a copy, or calibrate again (training.calibrate)"
     listed = manifest(folder)
     if listed is None or CALIBRATION not in listed.files:
+        if (folder / CALIBRATION).exists():
+            warnings.warn(
+                f"{folder / CALIBRATION} is not used, because {storage.MANIFEST} does not list it: it is that of "
+                "another model or checkpoint. Calibrate again (training.calibrate)",
+                stacklevel=2,
+            )
         return None
     storage.verify(folder, listed, remedy, [CALIBRATION])
-    content = storage.read_json(folder / CALIBRATION, remedy)
-    rows = [[row[name] for name in statespace.Calibration._fields] for row in content["subsets"].values()]
-    return statespace.Calibration(*jnp.asarray(rows, jnp.float32).T), content["data"]
+    content = storage.read_fields(_CalibrationFile, folder / CALIBRATION, remedy)
+    rows = [dataclasses.astuple(row) for row in content.subsets.values()]
+    return statespace.Calibration(*jnp.asarray(rows, jnp.float32).reshape(-1, 4).T), content.data
 
 
 def load(workdir: str | os.PathLike[str], *, calibrated: bool = True) -> Model:
@@ -291,6 +383,8 @@ def _load(workdir: Path, calibrated: bool) -> Model:
     like = TrainState(params, stats, None, jnp.int32(0))
     weights = read(workdir, step, like)
     fitted = read_calibration(workdir) if calibrated else None
+    if fitted and len(fitted[0].outcome) != 2 ** len(config.inputs):
+        raise storage.DamagedFileError(f"{workdir / CALIBRATION} is that of other inputs: {_remedy(workdir)}.")
     state = nnx.merge_state(weights.params, weights.stats)
     return Model(config, graphdef, state, step, settings, fitted[0] if fitted else None)
 

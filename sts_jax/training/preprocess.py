@@ -109,9 +109,11 @@ class Preprocessing:
         return jnp.sum(differs, axis=(-2, -1)) >= self.touch_blocks
 
     @classmethod
-    def from_json(cls, content: dict[str, Any]) -> "Preprocessing":
+    def from_json(cls, content: Any) -> "Preprocessing":
         """Make a preprocessing from the JSON values of `dataclasses.asdict`."""
-        if "resolution" not in content:  # it has a default value, but every model stores it
+        if (
+            not isinstance(content, dict) or "resolution" not in content
+        ):  # it has a default value, but every model stores it
             raise ValueError(f"field preprocessing.resolution is missing, got {content!r}")
         return storage.decode(cls, content, "preprocessing")
 
