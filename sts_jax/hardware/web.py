@@ -86,7 +86,7 @@ class Handler(http.server.BaseHTTPRequestHandler):
         if not super().parse_request():
             return False
         host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
-        foreign = origin is not None and urllib.parse.urlsplit(origin).netloc != host
+        foreign = origin is not None and origin.partition("://")[2] != host
         if self._names_server(host) and not foreign and self.headers.get("Sec-Fetch-Site") != "cross-site":
             return True
         self.send_error(403, "Open the page at the address that the program has printed")
