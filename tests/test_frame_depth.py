@@ -132,3 +132,13 @@ def test_a_textured_plane_in_perspective_equals_the_intersections_of_rays():
     shown = sts.optics.to_linear(frame.visual).reshape(-1, 3)[inside]
     assert inside.mean() > 0.08
     np.testing.assert_allclose(shown[:, :2], 0.5 + there[inside] / 0.09, atol=2e-3)
+
+
+def test_a_rod_narrower_than_a_pixel_may_cover_none_and_has_the_right_area_on_average():
+    rod, places = from_trimesh(trimesh.creation.box((0.1, 0.001, 0.001))), np.linspace(0, 2 * 0.15 / 128, 14, False)
+    for size, narrowest in ((128, 0), (256, 1)):  # pixels of 1.17 and 0.59 mm
+        poses = jnp.asarray([at(0, y, 0.0005) for y in places], jnp.float32)
+        frames = jax.vmap(lambda pose, n=size: sense(SENSOR, rod, pose, resolution=(n, n)))(poses)
+        rows = np.asarray(frames.segmentation).any(axis=2).sum(axis=1)
+        assert rows.min() == narrowest
+        assert frames.segmentation.sum(axis=(1, 2)).mean() == pytest.approx(0.1 * 0.001 / (0.15 / size) ** 2, rel=0.05)

@@ -9,12 +9,12 @@ import mujoco
 import numpy as np
 import pytest
 import trimesh
+from physics_scenes import PAD, box, part, solid_block
 from scipy.spatial.transform import Rotation
 
 from sts_jax import objects, physics
 from sts_jax.physics import engines, scene
 from sts_jax.sensor import Sensor
-from tests.physics_scenes import PAD, box, part, solid_block
 
 DROP = physics.Freefall(spread=0.02)  # m, so that few objects hang over the rim of the pad
 
