@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+ENCODINGS = ("cp1252", "gbk", "shift_jis", "big5", "euc_kr", "cp1251")  # of names that are not UTF-8
 LARGE = 2048  # pixels, images of at least twice this side are reduced while they are read
 
 
@@ -35,7 +36,7 @@ class Files:
     def place(self, name: bytes | str) -> Path | None:
         """Return the path of a file, or None if it is missing, without a record."""
         raw = name.encode(errors="surrogateescape") if isinstance(name, str) else name
-        for spelling in (os.fsdecode(raw), raw.decode("cp1252", "replace"), raw.decode("gbk", "replace")):
+        for spelling in (os.fsdecode(raw), *(raw.decode(encoding, "replace") for encoding in ENCODINGS)):
             relative = spelling.strip().strip('"').replace("\\", "/")
             base = os.path.basename(relative)
             for folder in (self.path.parent, self.images):

@@ -34,7 +34,7 @@ UNSUPPORTED = (
 )
 # Options of `map_Kd`, and how many values follow them at most. Options -s and -o are applied.
 _OPTIONS = {b"-s": 3, b"-o": 3, b"-t": 3, b"-mm": 2}
-_OPTIONS |= dict.fromkeys((b"-blendu", b"-blendv", b"-bm", b"-boost", b"-cc", b"-clamp", b"-imfchan", b"-texres"), 1)
+_OPTIONS |= dict.fromkeys(b"-blendu -blendv -bm -boost -cc -clamp -imfchan -texres -type".split(), 1)
 _TEXTURE = rb"(?im)^comment\s+texturefile\s+(.+?)\s*$"  # in the header of a PLY
 
 
@@ -95,20 +95,20 @@ def _loaded(content: Path | bytes, kind: str | None, resolver: Any) -> list[trim
     return [piece for piece in scene.dump() if isinstance(piece, trimesh.Trimesh) and len(piece.faces)]
 
 
-def _text(data: bytes) -> bytes:
+def _text(data: bytes, name: str = "the file") -> bytes:
     """Return a text without its byte-order mark, or raise an error if it is UTF-16."""
     if b"\0" in data[:1024] or data[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        raise Refusal("the file is no text of 8-bit characters: save it as UTF-8 if it is UTF-16")
+        raise Refusal(f"{name} is no text of 8-bit characters: save it as UTF-8 if it is UTF-16")
     return data.removeprefix(b"\xef\xbb\xbf")
 
 
-def _lines(data: bytes) -> Iterator[bytes]:
+def _lines(data: bytes, name: str = "the file") -> Iterator[bytes]:
     """Yield the lines of an OBJ or MTL text, without comment lines and with continued lines (backslash) joined.
 
     The names of groups and objects can end with a byte that looks like a backslash, in GBK for example.
     """
     start = b""
-    for line in _text(data).splitlines():
+    for line in _text(data, name).splitlines():
         line = start + line.strip()
         start = b""
         if line.endswith(b"\\") and line[:1] not in b"#gos":
@@ -136,7 +136,7 @@ def _materials(path: Path, files: Files) -> dict[bytes, Look]:
     """Read a material library (MTL)."""
     looks: dict[bytes, Look] = {}
     name = None
-    for line in _lines(path.read_bytes()):
+    for line in _lines(path.read_bytes(), str(path)):
         word, _, rest = line.replace(b"\t", b" ").partition(b" ")
         word = word.lower()
         if word == b"newmtl":
@@ -144,14 +144,19 @@ def _materials(path: Path, files: Files) -> dict[bytes, Look]:
             looks[name] = Look()
         elif word == b"kd" and name is not None and rest.split()[:1] not in ([b"spectral"], [b"xyz"]):
             color = np.array(rest.split()[:3], float)
-            if color.size not in (1, 3) or not (np.isfinite(color).all() and color.min() >= 0):
-                raise Refusal(f"{path}: a colour must be three numbers in [0, 1], got {_name(line)!r}")
-            looks[name] = looks[name]._replace(color=np.broadcast_to(color, 3).copy())
+            looks[name] = looks[name]._replace(color=_unit(color if color.size > 1 else np.repeat(color, 3), 3, path))
         elif word == b"map_kd" and name is not None:
             looks[name], ignored = _mapped(looks[name], rest.strip())
             if ignored:
                 files.problems.append(f"{path}: options of map_Kd are ignored ({ignored})")
     return looks
+
+
+def _unit(color: np.ndarray, size: int, path: Path) -> np.ndarray:
+    """Return a colour unless its values are not in [0, 1], except for rounding."""
+    if color.shape != (size,) or not ((color >= 0) & (color <= 1.01)).all():
+        raise Refusal(f"{path}: the colour of a material must be {size} numbers in [0, 1], got {color.tolist()}")
+    return color
 
 
 def _mapped(look: Look, rest: bytes) -> tuple[Look, str]:
@@ -201,6 +206,10 @@ def _obj(data: bytes, files: Files) -> list[trimesh.Trimesh]:
     texel = _numbers(coordinates, 1, "texture coordinate")
     texel = np.concatenate([texel, np.zeros((len(texel), 1))], axis=1)[:, :2]
     painted = place[:, 3:6] if place.shape[1] >= 6 else None
+    if painted is not None:
+        if not (painted >= 0).all():
+            raise Refusal("the colour of a vertex is NaN or negative: repair the file")
+        painted = painted / 255 if painted.max() > 1 else painted
     looks = {} if files.plain else _libraries(data, files)
     pictures: dict[bytes | None, Image.Image | None] = {}
     pieces = []
@@ -215,6 +224,7 @@ def _obj(data: bytes, files: Files) -> list[trimesh.Trimesh]:
                 triangles = cut(place[[corner[0] for corner in polygon], :3])
                 polygons[row] = [polygon[corner] for corner in triangles.ravel()]
         faces = np.array([corner for polygon in polygons for corner in polygon], np.int64).reshape(-1, 3, 2)
+        faces[..., 1] = np.where(has_texels, faces[..., 1], -1)
         used, index = np.unique(faces[..., 0] * (len(texel) + 1) + faces[..., 1] + 1, return_inverse=True)
         vertex, corner = np.divmod(used, len(texel) + 1)
         look = looks.get(name or b"")
@@ -276,9 +286,11 @@ def _stl(data: bytes, _: Files) -> list[trimesh.Trimesh]:
     if 84 + 50 * number != len(data) and text.startswith(b"solid") and b"\0" not in text[:1024]:
         if text.rfind(b"endsolid") <= text.rfind(b"endfacet"):
             raise Refusal("the file is truncated (its last line is not `endsolid`): replace the file")
-        corners = np.array(re.findall(rb"[\r\n]\s*vertex\s+(\S+)\s+(\S+)\s+(\S+)", text), float).reshape(-1, 3)
-        if len(corners) != 3 * len(re.findall(rb"[\r\n]\s*endfacet", text)):
+        lines = [line.split() for line in text.splitlines()]
+        rows = [line[1:] for line in lines if line[:1] == [b"vertex"]]
+        if len(rows) != 3 * lines.count([b"endfacet"]) or any(len(row) != 3 for row in rows):
             raise Refusal("the file is damaged, because some facets do not have three corners: replace the file")
+        corners = np.array(rows, float).reshape(-1, 3)
     elif len(data) < 84 + 50 * number or len(data) < 84:
         raise Refusal(
             f"the file is truncated or not an STL: its header announces {number:,} triangles, but the file has "
@@ -356,10 +368,10 @@ def _gltf(data: bytes, files: Files) -> list[trimesh.Trimesh]:
             raise FileNotFoundError(f"{files.path}: the mesh refers to the missing file {part['uri']}: add it")
         part["uri"], buffers[f"{number}"] = f"{number}", content
     _check(header, files)
-    looks = [_look(header, material) for material in header.get("materials", [])]
+    looks = [_look(material, files.path) for material in header.get("materials", [])]
     images = {} if files.plain else _images(header, files, buffers, looks)
     for number, (color, _) in enumerate(looks):
-        header["materials"][number] = {"name": f"{number}", "pbrMetallicRoughness": {"baseColorFactor": color}}
+        header["materials"][number] = {"name": f"{number}", "pbrMetallicRoughness": {"baseColorFactor": color.tolist()}}
     for mesh in header.get("meshes", []):
         for primitive in mesh["primitives"]:
             primitive.pop("extensions", None)
@@ -398,7 +410,7 @@ def _check(header: dict[str, Any], files: Files) -> None:
     ignored = sorted(set(used) & set(UNSUPPORTED))
     if any("skin" in node for node in header.get("nodes", [])):
         ignored.append("skins")
-    if any("weights" in mesh for mesh in header.get("meshes", [])):
+    if any(any(part.get("weights", [])) for part in [*header.get("meshes", []), *header.get("nodes", [])]):
         ignored.append("morph targets")
     if ignored:
         files.problems.append(f"unsupported parts of glTF are ignored ({', '.join(ignored)}): export it without them")
@@ -420,14 +432,12 @@ def _check(header: dict[str, Any], files: Files) -> None:
                     raise Refusal(f"{name} has whole numbers (KHR_mesh_quantization), not supported: export floats")
 
 
-def _look(header: dict[str, Any], material: dict[str, Any]) -> tuple[list[float], dict[str, Any]]:
+def _look(material: dict[str, Any], path: Path) -> tuple[np.ndarray, dict[str, Any]]:
     """Return the colour factor (4,) of a glTF material and the reference to its texture, {} without one."""
     surface = material.get("pbrMetallicRoughness", {})
     gloss = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
-    color = surface.get("baseColorFactor", gloss.get("diffuseFactor", [1.0, 1.0, 1.0, 1.0]))
-    if np.shape(color) != (4,) or not np.isfinite(np.array(color, float)).all():
-        raise Refusal(f"a colour factor must be four numbers in [0, 1], got {color}")
-    return color, surface.get("baseColorTexture", gloss.get("diffuseTexture", {}))
+    color = np.array(surface.get("baseColorFactor", gloss.get("diffuseFactor", [1.0] * 4)), float)
+    return _unit(color, 4, path), surface.get("baseColorTexture", gloss.get("diffuseTexture", {}))
 
 
 def _transform(info: dict[str, Any]) -> tuple[int, np.ndarray, float, np.ndarray]:
@@ -439,7 +449,7 @@ def _transform(info: dict[str, Any]) -> tuple[int, np.ndarray, float, np.ndarray
 
 
 def _images(
-    header: dict[str, Any], files: Files, buffers: dict[str, bytes], looks: list[tuple[list[float], dict[str, Any]]]
+    header: dict[str, Any], files: Files, buffers: dict[str, bytes], looks: list[tuple[np.ndarray, dict[str, Any]]]
 ) -> dict[int, Image.Image]:
     """Read the images of the materials that have one."""
     read: dict[int, Image.Image | None] = {}
