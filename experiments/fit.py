@@ -180,7 +180,7 @@ def main(config: Config) -> None:
     if config.force == 0:
         raise ValueError("--force is 0, but it must be > 0 (N), so that the object leaves an imprint")
     sensor = sts.Sensor() if config.sensor is None else sts.Sensor.load(config.sensor)
-    body = laying.read(config, config.mesh)
+    body = laying.read(config, sensor, config.mesh)
     pose, wrench, words = laying.lay(config, sensor, body)
     given = jnp.asarray(pose, jnp.float32), jnp.asarray(wrench, jnp.float32)
     target = touch(sensor, body, *given, resolution=config.resolution)

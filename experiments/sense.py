@@ -96,7 +96,7 @@ def main(config: Config) -> None:
     names = sts.objects.CATEGORIES if config.mesh == "classes" else (config.mesh,)
     pictures = []
     for name in names:
-        body = read(config, name)
+        body = read(config, sensor, name)
         frame, between, lines = look(config, sensor, body)
         size, faces = sts.objects.facts(body, (0.0, 0.0))[:2]
         print(f"{name}: {size} mm, {faces}\n{lines}", flush=True)

@@ -149,7 +149,17 @@ def pose_to_matrix(pose: Float[AnyArray, "*n 7"]) -> Float[Array, "*n 4 4"]:
 
 @checked
 def pose_from_matrix(matrix: Float[AnyArray, "*n 4 4"]) -> Float[Array, "*n 7"]:
-    """Pose, with `w >= 0`, of a homogeneous matrix. See `quat_from_matrix` if its 3x3 part is not a rotation."""
+    """Pose, with `w >= 0`, of a homogeneous matrix. See `quat_from_matrix` if its 3x3 part is not a rotation.
+
+    A matrix that mirrors is an error, except in traced code.
+    """
+    if not isinstance(matrix, jax.core.Tracer):
+        determinant = np.linalg.det(np.asarray(matrix[..., :3, :3], float))
+        if (determinant < 0).any():
+            raise ValueError(
+                f"the matrix mirrors (its 3x3 part has the determinant {determinant.min():.3g}), so it has no pose: "
+                "change the sign of one axis, or of one column"
+            )
     return jnp.concatenate([matrix[..., :3, 3], quat_from_matrix(matrix[..., :3, :3])], axis=-1)
 
 

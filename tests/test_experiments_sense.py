@@ -46,7 +46,7 @@ def test_all_streams_of_a_class_in_one_picture(tmp_path, capsys):
 
 def test_a_file_is_pressed_by_its_weight(box, tmp_path, capsys):
     config = sense.Config(str(box), out=tmp_path / "box.png", resolution=TINY, mass=0.2, crop=True)
-    body, sensor = laying.read(config, str(box)), sts.Sensor()
+    body, sensor = laying.read(config, sts.Sensor(), str(box)), sts.Sensor()
     frame, _, words = sense.look(config, sensor, body)
     assert "0.2 kg, pressed by 1.96 N" in words
     assert float(frame.pressure.sum()) * 1e-6 == pytest.approx(0.2 * laying.G, rel=0.005)
@@ -59,7 +59,7 @@ def test_a_file_is_pressed_by_its_weight(box, tmp_path, capsys):
 
 def test_the_object_lies_at_the_configured_place(box):
     config = sense.Config(str(box), mass=0.1, position=(0.02, -0.01), turn=90.0)
-    body = laying.read(config, str(box))
+    body = laying.read(config, sts.Sensor(), str(box))
 
     def corners(config):
         pose, wrench, words = laying.lay(config, sts.Sensor(), body)

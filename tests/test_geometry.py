@@ -88,3 +88,13 @@ def test_the_gradient_of_a_round_trip_through_a_matrix_is_the_identity(vector):
 
     got = jax.jacrev(round_trip)(jnp.array(vector))  # the round trip is the identity
     np.testing.assert_allclose(got, np.eye(3), atol=2e-3)
+
+
+def test_a_matrix_that_mirrors_has_no_pose():
+    mirrored = np.eye(4)
+    mirrored[1, 1] = -1
+    with pytest.raises(ValueError, match=r"the matrix mirrors \(its 3x3 part has the determinant -1\)"):
+        geometry.pose_from_matrix(mirrored)
+    with pytest.raises(ValueError, match="mirrors"):
+        geometry.pose_from_matrix(np.stack([np.eye(4), mirrored]))
+    assert np.isfinite(jax.jit(geometry.pose_from_matrix)(mirrored)).all()

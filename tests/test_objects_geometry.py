@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from object_files import surface
 
-from sts_jax import objects
+from sts_jax import geometry, objects
 from sts_jax.objects.polygons import cut
 
 # Outlines (mm), counter-clockwise: concave, with straight and repeated corners, with a hole, and touching itself.
@@ -191,3 +191,47 @@ def test_repeated_polygons_are_dropped_whatever_their_first_corner(tmp_path):
     with pytest.warns(UserWarning, match="28 repeated faces are dropped"):
         body = objects.load(write(tmp_path / "x.obj", vertices, polygons + again))
     assert volume(body) == pytest.approx(shoelace(np.array(OUTLINES["letter"]) * 1e-3) * 0.01, rel=1e-4)
+
+
+def test_the_origin_of_the_file_places_a_body_by_the_frame_of_its_file(tmp_path):
+    mesh = box(60, 40, 30, at=(100, -20, 5))
+    body = objects.load(saved(tmp_path, mesh), up="y")
+    turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # y of the file is z of the body
+    frame = np.array([0.01, 0.02, 0.03, 0.8, 0, 0.6, 0])  # pose of the turned frame of the file
+    pose = geometry.pose_multiply(frame, np.array([*-np.asarray(body.origin), 1, 0, 0, 0]))
+    placed = np.asarray(geometry.transform(pose, surface(body).vertices.astype(np.float32)))
+    truth = np.asarray(geometry.transform(frame, (mesh.vertices @ turn.T).astype(np.float32)))
+    np.testing.assert_allclose(np.sort(placed, axis=0), np.sort(truth, axis=0), atol=1e-6)
+    np.testing.assert_allclose(objects.mirror(body).origin, body.origin * np.array([1, -1, 1]))
+
+
+@pytest.mark.parametrize("kind", ["obj", "stl", "glb"])
+@pytest.mark.parametrize(("side", "pad"), [(5, 150), (150, 150), (1, 30), (30, 30), (300, 300)])
+def test_cubes_of_the_limits_of_a_pad_are_accepted(tmp_path, kind, side, pad):
+    box(side, side, side, at=(7.7, 3.1, 0.3)).export(tmp_path / f"cube.{kind}")
+    body = objects.load(tmp_path / f"cube.{kind}", pad=pad * 1e-3)
+    assert np.ptp(surface(body).vertices, axis=0) == pytest.approx(side * 1e-3, rel=1e-5)
+    objects.load(tmp_path / f"cube.{kind}", longest_side=side * 1e-3, pad=pad * 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("size", "arguments", "message"),
+    [
+        ((31, 10, 10), {"pad": 0.03}, r"longest side is 0\.031 m, but it must be at most 0\.03 m, the width of the"),
+        ((4.9, 3, 3), {}, "longest side is 4.9 mm, but it must be at least 5 mm"),
+        ((60, 40, 30), {"pad": 0.0}, "pad must be a positive number of metres"),
+        ((60, 40, 30), {"mass": 300.0}, r"mass=300 makes an object of 300 kg in 72 ml, .* lead: mass is in kilograms"),
+        ((60, 40, 30), {"density": 7800.0}, r"density=7800 .* lead: density is in kilograms per square metre"),
+        ((86, 54, 0.02), {}, r"the object is 0\.02 mm thick, .* at least 0\.1 mm: thicken the mesh"),
+        ((86, 54, 1e-4), {"mass": 0.001}, r"the object is 0\.0001 mm thick"),
+        ((86, 0.05, 0.05), {}, r"the object is 0\.05 mm thick"),
+    ],
+)
+def test_an_impossible_size_mass_or_thickness_is_named(tmp_path, size, arguments, message):
+    box(*size).export(tmp_path / "x.obj")
+    with pytest.raises(ValueError, match=rf"x\.obj: (the )?{message}"):
+        objects.load(tmp_path / "x.obj", **arguments)
+
+
+def test_a_dense_body_of_lead_is_accepted(tmp_path):
+    assert objects.load(saved(tmp_path, box(20, 20, 20)), mass=0.09).shell_mass == pytest.approx(0.09)

@@ -54,7 +54,7 @@ def check(config: Placed) -> None:
     drawing.check_picture(config.out)
 
 
-def read(config: Placed, name: str) -> sts.objects.Body:
+def read(config: Placed, sensor: sts.Sensor, name: str) -> sts.objects.Body:
     """Load the object from a mesh file, or make one of an object class such as `bottle`."""
     if name not in sts.objects.CATEGORIES:
         path = Path(name)
@@ -71,6 +71,7 @@ def read(config: Placed, name: str) -> sts.objects.Body:
             up=config.up or ("y" if path.suffix.lower() in (".glb", ".gltf") else "z"),
             texture=config.texture,
             faces=config.faces,
+            pad=float(min(sensor.gel.size)),
         )
     for option in ("longest_side", "scale", "up", "faces", "texture"):
         if getattr(config, option) is not None:

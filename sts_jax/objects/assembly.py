@@ -83,6 +83,7 @@ def assemble(
         interior=jnp.asarray(pad(contents, size, 0.0), single),
         contents_density=jnp.asarray(contents_density, single),
         category=jnp.asarray(category, np.int32),
+        origin=jnp.asarray(-origin, single),
     )
 
 

@@ -17,8 +17,8 @@ FACE_CLASSES = (1024, 4096, 16384, 131072)
 PART_CLASSES = (1, 8)
 HULL_CLASSES = (32, 64)
 TEXTURE_CLASSES = (1, 256, 1024)
-PAD = 0.15  # m, side of the sensor's pad and largest side of an object
-SMALLEST = 0.005  # m, longest side of the smallest object. A smaller mesh probably has another unit
+PAD = 0.15  # m, side of the paper's pad, and longest side of an object on it
+SMALLEST = 0.005  # m, longest side of the smallest object on it. A smaller mesh probably has another unit
 LEVEL_STEPS = 30  # bisection steps for the level of the contents, more than float32 can resolve
 
 Direction = Float[Array | np.ndarray, "3"] | tuple[float, float, float]
@@ -50,6 +50,7 @@ class Body:
     interior: Float[Array, "*n i 3 3"]  # Triangles of the closed surface around the contents (m), zeros if solid.
     contents_density: Float[Array, "*n"]  # Density of the contents (kg/m^3), 0 for solid objects.
     category: Int[Array, "*n"]  # Index into CATEGORIES, or -1 for an object of no category.
+    origin: Float[Array, "*n 3"]  # Where the origin of the mesh file, or of the class's shape, lies (m).
 
     def check(self) -> None:
         """Raise a ValueError unless this is a single body with finite values and valid indices, not traced by `jit`."""
@@ -154,6 +155,7 @@ def mirror(body: Body) -> Body:
         shell_com=body.shell_com * flip,
         shell_inertia=body.shell_inertia * jnp.outer(flip, flip),
         interior=body.interior[..., corners, :] * flip,
+        origin=body.origin * flip,
     )
 
 

@@ -6,8 +6,13 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from jaxtyping import Float
+from scipy.spatial import ConvexHull
 
-from sts_jax.objects.body import FACE_CLASSES, PAD, SMALLEST
+from sts_jax.objects.body import FACE_CLASSES, PAD, SMALLEST, Body
+
+ROUNDING = 1e-5  # share by which a length may miss a limit, because float32 and decimals are rounded
+THINNEST = 1e-4  # m, thickness of the thinnest object: convex hulls have a tolerance of half of it
+LEAD = 11_340.0  # kg/m^3, density of lead (CRC Handbook of Chemistry and Physics)
 
 LARGEST_UV = 1e4  # repetitions of a texture, beyond which float32 does not resolve its texels
 
@@ -18,10 +23,16 @@ def check_positive(name: str, value: float | None, unit: str) -> None:
         raise ValueError(f"{name} must be a positive number of {unit}, got {value!r}")
 
 
-def check_side(name: str, value: float | None) -> None:
+def limits(pad: float) -> tuple[float, float]:
+    """Return the limits of the longest side of an object (m) on a pad of a width (m)."""
+    return min(SMALLEST, pad * SMALLEST / PAD), pad
+
+
+def check_side(name: str, value: float | None, pad: float = PAD) -> None:
     """Raise a ValueError unless a length is None or a possible longest side of an object (m)."""
-    if value is not None and not SMALLEST <= value <= PAD:
-        raise ValueError(f"{name} is {value} m, but it must be from {SMALLEST} to {PAD} m, the pad's width")
+    low, high = limits(pad)
+    if value is not None and not low * (1 - ROUNDING) <= value <= high * (1 + ROUNDING):
+        raise ValueError(f"{name} is {value} m, but it must be from {low:g} to {high:g} m, the pad's width")
 
 
 def check_file(path: Path) -> None:
@@ -70,3 +81,28 @@ def check_appearance(colors: Float[np.ndarray, "f 3 3"], uv: Float[np.ndarray, "
         raise ValueError("the mesh has colours that are NaN or infinite: repair its colours or materials")
     if not (np.abs(uv) <= LARGEST_UV).all():
         raise ValueError(f"the mesh has texture coordinates that are NaN or beyond {LARGEST_UV:,.0f}: repair them")
+
+
+def check_thickness(body: Body, least: float = THINNEST) -> None:
+    """Raise a ValueError if a body is too thin for its collision hull."""
+    points = np.asarray(body.vertices, float)
+    hull = ConvexHull(points)
+    a, b, c = np.moveaxis(points[hull.simplices], 1, 0)
+    largest = np.argsort(-np.linalg.norm(np.cross(b - a, c - a), axis=1))[:100]
+    thickness = float(np.ptp(points @ hull.equations[largest, :3].T, axis=0).min())
+    if thickness < least * (1 - ROUNDING):
+        raise ValueError(
+            f"the object is {thickness * 1e3:.4g} mm thick, but stable contacts need at least {least * 1e3:g} mm: "
+            "thicken the mesh"
+        )
+
+
+def check_density(name: str, value: float, unit: str, body: Body) -> None:
+    """Raise a ValueError if the setting `name` makes a body denser than lead, over the volume of its hull."""
+    volume = ConvexHull(np.asarray(body.vertices, float)).volume
+    mean = float(body.shell_mass) / volume
+    if mean > LEAD:
+        raise ValueError(
+            f"{name}={value:g} makes an object of {float(body.shell_mass):.3g} kg in {volume * 1e6:.3g} ml, which is "
+            f"{mean / LEAD:.3g} times as dense as lead: {name} is in {unit}"
+        )

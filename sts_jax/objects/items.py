@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sts_jax._checked import check_arrays
-from sts_jax.objects.body import FACE_CLASSES, HULL_CLASSES, PART_CLASSES, TEXTURE_CLASSES, Body
+from sts_jax.objects.body import FACE_CLASSES, HULL_CLASSES, PAD, PART_CLASSES, TEXTURE_CLASSES, Body
 from sts_jax.objects.formats import references
 from sts_jax.storage import decode, write_arrays
 
@@ -45,6 +45,7 @@ class Library:
     classes: tuple[str, ...]  # Classes of the items, sorted.
     cache: Path | None = None  # Folder of the cached bodies.
     parts: bool = False  # True if objects that stand off their convex hull collide as convex parts.
+    pad: float = PAD  # Width of the sensor's pad (m).
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,7 +76,7 @@ def cache_path(library: Library, item: Item) -> Path:
     fields = [field.name for field in dataclasses.fields(Body)]
     settings = [item.scale, item.up, item.front, item.label, item.notes]
     layout = [_FORMAT, fields, FACE_CLASSES, HULL_CLASSES, PART_CLASSES, TEXTURE_CLASSES]
-    digest.update(json.dumps([layout, settings, NUM_FACES, LARGEST, library.parts]).encode())
+    digest.update(json.dumps([layout, settings, NUM_FACES, LARGEST, library.parts, library.pad]).encode())
     if not item.path.is_file():
         raise FileNotFoundError(
             f"{item.path}: no such mesh file: restore it, or call objects.library() again to list the existing files"

@@ -14,13 +14,12 @@ from typing import Literal
 
 import numpy as np
 import trimesh
-from scipy.spatial import ConvexHull
 
 from sts_jax._checked import checked
 from sts_jax.objects import shapenet
 from sts_jax.objects.assembly import STEEL, WALL
 from sts_jax.objects.body import CATEGORIES, PAD, Body
-from sts_jax.objects.checks import check_positive
+from sts_jax.objects.checks import check_positive, check_thickness
 from sts_jax.objects.items import (
     LARGEST,
     NUM_FACES,
@@ -53,11 +52,12 @@ def library(
     scale: float | Mapping[str, float] | None = None,
     up: Literal["x", "y", "z"] | None = None,
     parts: bool = False,
+    pad: float = PAD,
 ) -> Library:
     """List the objects of a folder without opening a mesh, sorted by class and name.
 
-    Objects longer than 0.12 m are scaled down to this length, and meshes of more than 4,096 faces or vertices are
-    decimated.
+    Objects longer than 0.8 times the pad (0.12 m) are scaled down to this length, and meshes of more than 4,096 faces
+    or vertices are decimated.
 
     If the folder or one of its direct sub-folders contains ShapeNetSem's metadata.csv, this table lists the objects,
     with their size, orientation and class. Meshes are expected at models-OBJ/models/ID.obj, and images in
@@ -75,6 +75,7 @@ def library(
             "z" for other formats.
         parts: If True, objects whose convex hull reaches more than 2 mm outside the surface are decomposed into convex
             parts. This takes about ten seconds per object and needs the package coacd.
+        pad: Width of the sensor's pad (m), such as `min(sensor.gel.size)`.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -82,6 +83,7 @@ def library(
     scales = dict(scale) if isinstance(scale, Mapping) else {} if scale is None else {"*": scale}
     for length in scales.values():
         check_positive("scale", length, "metres per unit of the files")
+    check_positive("pad", pad, "metres")
     root = shapenet.find_root(folder)
     items, skipped = _walked(folder) if root is None else shapenet.items(root)
     if not items:
@@ -107,6 +109,7 @@ def library(
         classes=tuple(sorted({item.label for item in items})),
         cache=None if cache is None else Path(cache),
         parts=parts,
+        pad=pad,
     )
 
 
@@ -262,7 +265,8 @@ def _load(collection: Library, item: Item) -> Entry:
         body = load(
             item.path,
             scale=item.scale,
-            largest=LARGEST,
+            largest=LARGEST * (collection.pad / PAD),
+            pad=collection.pad,
             density=STEEL if solid else WALL,
             hollow=not solid,
             up=item.up,
@@ -275,13 +279,7 @@ def _load(collection: Library, item: Item) -> Entry:
     vertices = np.asarray(body.vertices, float)
     length = float(np.ptp(vertices, axis=0).max())
     length = max([length, *(one.message.length for one in caught if isinstance(one.message, ScaledDown))])
-    shape = ConvexHull(np.asarray(body.hulls[0], float))
-    thickness = float(np.ptp(vertices @ shape.equations[:, :3].T, axis=0).min())
-    if thickness < THINNEST:
-        raise ValueError(
-            f"{item.path}: the object is {thickness * 1e3:.4g} mm thick, but stable contacts need at least "
-            f"{THINNEST * 1e3:g} mm: thicken the mesh"
-        )
+    check_thickness(body, THINNEST)
     apart = gaps(body)
     if collection.parts and apart[1] > HOLLOW:
         try:

@@ -12,9 +12,18 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
 from sts_jax._checked import checked
-from sts_jax.objects.assembly import CONTENTS, WALL, assemble
-from sts_jax.objects.body import FACE_CLASSES, PAD, SMALLEST, Body, check_category
-from sts_jax.objects.checks import check_file, check_positive, check_side, checked_corners
+from sts_jax.objects.assembly import CONTENTS, STEEL, WALL, assemble
+from sts_jax.objects.body import FACE_CLASSES, PAD, Body, check_category
+from sts_jax.objects.checks import (
+    ROUNDING,
+    check_density,
+    check_file,
+    check_positive,
+    check_side,
+    check_thickness,
+    checked_corners,
+    limits,
+)
 from sts_jax.objects.files import Files, read_image
 from sts_jax.objects.formats import read
 from sts_jax.objects.hulls import convex_hull
@@ -72,12 +81,16 @@ def load(
     faces: int | None = None,
     parts: bool = False,
     category: int = -1,
+    pad: float = PAD,
 ) -> Body:
     """Load a mesh file as a body. All meshes of the file are merged into one.
 
     The mesh frame is the file's frame, rotated by `up` and `front`, with the origin at the centroid of the collision
     hull: the convex hull of the mesh, reduced to at most 64 vertices. `gaps` measures how far the surface lies outside.
-    Surfaces that are not closed are visible from both sides.
+    Surfaces that are not closed are visible from both sides. `Body.origin` has the place of the file's origin.
+
+    Polygons are cut into triangles, also concave ones. Closed parts are turned outwards, or inwards around a cavity,
+    and repeated faces are dropped with a warning.
 
     Textures, 8-bit colours and the diffuse colour `Kd` of an OBJ file are read as sRGB. Colour factors and vertex
     colours of a glTF file are read as linear light (glTF specification). Alpha values are ignored, and so is the `Kd`
@@ -86,11 +99,11 @@ def load(
 
     Args:
         path: The mesh file. Its materials and images are looked up in the same folder.
-        longest_side: Longest side of the bounding box after scaling (m), from 5 mm to 0.15 m. None keeps the
-            file's size. Must be None if `scale` is given.
+        longest_side: Longest side of the bounding box after scaling (m), from a thirtieth of the pad, but at
+            most 5 mm, to the width of the pad. None keeps the file's size. Must be None if `scale` is given.
         scale: Length of one unit of the file (m). None is 1 m.
         largest: Upper limit of the longest side (m), to which a larger mesh is scaled down with a warning. None raises
-            an error for a mesh that is longer than 0.15 m, the width of the pad.
+            an error for a mesh that is longer than the pad.
         mass: Mass of the body (kg), spread over its surface. The body then has no contents. None computes the mass
             of the shell from `density`.
         density: Mass of the shell per area (kg/m^2), if `mass` is None.
@@ -106,12 +119,14 @@ def load(
             texture is replaced by one colour at each corner of each face.
         parts: If True, the body collides as convex parts (`decompose`). This needs the package coacd.
         category: Index into CATEGORIES, or -1 for an object of no category.
+        pad: Width of the sensor's pad (m), such as `min(sensor.gel.size)`.
     """
     path = Path(path)
     try:
         check_positive("scale", scale, "metres per unit of the file")
-        check_side("longest_side", longest_side)
-        check_side("largest", largest)
+        check_positive("pad", pad, "metres")
+        check_side("longest_side", longest_side, pad)
+        check_side("largest", largest, pad)
         if longest_side is not None and scale is not None:
             raise ValueError("give longest_side or scale, not both")
         if faces is not None and faces < 4:
@@ -126,11 +141,16 @@ def load(
         corners = checked_corners(pieces, faces) @ turn.T
         if texture is not None:
             _wear(pieces, Path(texture))
-        surface = merge(corners * _factor(path, corners, longest_side, scale, largest), *albedo(path, pieces))
+        surface = merge(corners * _factor(path, corners, longest_side, scale, largest, pad), *albedo(path, pieces))
         surface = repaired(path, surface)
         if faces is not None and max(len(surface.faces), len(surface.vertices)) > faces:
             surface = decimate(path, surface, faces)
         body = _body(path, surface, mass, density, hollow, strict, category)
+        check_thickness(body)
+        if mass is not None:
+            check_density("mass", mass, "kilograms", body)
+        elif density > STEEL:
+            check_density("density", density, "kilograms per square metre of the surface", body)
         return decompose(body) if parts else body
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
@@ -157,7 +177,7 @@ def _wear(pieces: list[trimesh.Trimesh], texture: Path) -> None:
 
 
 def _factor(
-    path: Path, corners: np.ndarray, longest_side: float | None, scale: float | None, largest: float | None
+    path: Path, corners: np.ndarray, longest_side: float | None, scale: float | None, largest: float | None, pad: float
 ) -> float:
     """Return the factor from the file's units to metres, after a check of the size."""
     extent = float(np.ptp(corners, axis=(0, 1)).max())
@@ -165,9 +185,10 @@ def _factor(
         return longest_side / extent
     factor = 1.0 if scale is None else scale
     extent *= factor
-    if extent < SMALLEST:
+    low, high = limits(pad)
+    if extent < low * (1 - ROUNDING):
         raise ValueError(
-            f"the longest side is {extent * 1e3:.2g} mm, but it must be at least {SMALLEST * 1e3:g} mm: check "
+            f"the longest side is {extent * 1e3:.4g} mm, but it must be at least {low * 1e3:g} mm: check "
             "the unit of the file, and give longest_side (in metres), or give scale (in metres per unit)"
         )
     if largest is not None and extent > largest:
@@ -175,10 +196,10 @@ def _factor(
         note.length = extent
         warnings.warn(note, stacklevel=3)
         return factor * largest / extent
-    if extent > PAD:
+    if extent > high * (1 + ROUNDING):
         raise ValueError(
-            f"the longest side is {extent:.3g} m, but it must be at most {PAD} m, the width of the sensor's pad: give "
-            "longest_side (in metres), or give scale (in metres per unit, 0.001 if the file is in millimetres)"
+            f"the longest side is {extent:.4g} m, but it must be at most {high:g} m, the width of the sensor's pad: "
+            "give longest_side (in metres), or give scale (in metres per unit, 0.001 if the file is in millimetres)"
         )
     return factor
 

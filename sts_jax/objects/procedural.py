@@ -10,7 +10,8 @@ from jaxtyping import PRNGKeyArray
 
 from sts_jax._checked import check_key
 from sts_jax.objects.assembly import CONTENTS, assemble
-from sts_jax.objects.body import CATEGORIES, FACE_CLASSES, PAD, SMALLEST, Body
+from sts_jax.objects.body import CATEGORIES, FACE_CLASSES, PAD, Body
+from sts_jax.objects.checks import ROUNDING, limits
 from sts_jax.objects.families import bottle, camera, cutlery, mouse, scissors, watch, webcam
 from sts_jax.objects.shapes import Part
 
@@ -71,17 +72,18 @@ def find_family(category: str) -> Family:
     return family
 
 
-def make(key: PRNGKeyArray, category: str | Family) -> Body:
+def make(key: PRNGKeyArray, category: str | Family, *, pad: float = PAD) -> Body:
     """Generate a random object of a category: a `Family` or a name for `find_family`. Equal keys lead to equal objects.
 
-    Its +z axis points up in its usual pose. The longest side is 50 to 130 mm for the CATEGORIES.
+    Its +z axis points up in its usual pose. The longest side is 50 to 130 mm for the CATEGORIES. That of a `Family` may
+    be 5 to 150 mm on the paper's pad, and 1/30 to 1 times the width `pad` (m) of a smaller one.
     """
     check_key(key)
     family = find_family(category) if isinstance(category, str) else category
     words = np.asarray(jax.random.key_data(key)).ravel()
     parts = family.parts(np.random.default_rng([*(int(word) for word in words), family.seed]))
     try:
-        _check(parts)
+        _check(parts, pad)
         return _assembled(parts, CATEGORIES.index(family.name) if family.name in CATEGORIES else -1)
     except ValueError as error:
         raise ValueError(f"family {family.name}: {error}") from error
@@ -106,7 +108,7 @@ def _assembled(parts: list[Part], category: int) -> Body:
     )
 
 
-def _check(parts: list[Part]) -> None:
+def _check(parts: list[Part], pad: float) -> None:
     """Raise a ValueError unless the parts form an object of an allowed size."""
     if not parts:
         raise ValueError("parts() must return at least one Part, got none")
@@ -122,8 +124,9 @@ def _check(parts: list[Part]) -> None:
     if not np.isfinite(points).all():
         raise ValueError(f"all vertices must be finite, got {points[~np.isfinite(points)][0]}")
     longest = float(np.ptp(points, axis=0).max())
-    if not 1e3 * SMALLEST <= longest <= 1e3 * PAD:
+    low, high = (1e3 * length for length in limits(pad))
+    if not low * (1 - ROUNDING) <= longest <= high * (1 + ROUNDING):
         raise ValueError(
-            f"the longest side must be {1e3 * SMALLEST:g} to {1e3 * PAD:g} mm, got {longest:.3g} mm: give the parts in "
+            f"the longest side must be {low:g} to {high:g} mm, got {longest:.3g} mm: give the parts in "
             "millimetres, or scale them to a length with shapes.scaled"
         )
