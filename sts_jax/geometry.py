@@ -8,7 +8,7 @@ the identity. Arguments whose shapes start with `*n` may have any leading axes.
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from sts_jax._checked import checked
 
@@ -90,22 +90,68 @@ def quat_from_matrix(matrix: Float[AnyArray, "*n 3 3"]) -> Float[Array, "*n 4"]:
 @jax.custom_jvp
 def _largest_eigenvector(matrix: Float[Array, "*n 4 4"]) -> Float[Array, "*n 4"]:
     """Unit eigenvector of the largest eigenvalue of symmetric matrices, with a gradient also if others are equal."""
-    return jnp.linalg.eigh(matrix)[1][..., :, -1]
+    values, vectors = _eigh(matrix)
+    return _column(vectors, jnp.argmax(values, axis=-1))
 
 
 @_largest_eigenvector.defjvp
 def _largest_eigenvector_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     # dv = sum_i v_i (v_i . dA v) / (lambda - lambda_i), over the eigenvectors v_i other than v, the one of the largest
-    # eigenvalue lambda. A term is set to 0 if lambda_i is equal to lambda. The derivative of `eigh` cannot be used,
-    # because it divides by the differences of all pairs of eigenvalues, and for a rotation three of them are equal.
-    values, vectors = jnp.linalg.eigh(primals[0])
-    largest = vectors[..., :, -1]
-    gap = values[..., -1:] - values[..., :-1]
-    simple = gap > 1e-6 * jnp.abs(values[..., -1:])
+    # eigenvalue lambda. A term is set to 0 if lambda_i is equal to lambda. The derivative of an eigendecomposition
+    # divides by the differences of all pairs of eigenvalues, and for a rotation three of them are equal.
+    values, vectors = _eigh(primals[0])
+    which = jnp.argmax(values, axis=-1)
+    largest = _column(vectors, which)
+    top = jnp.take_along_axis(values, which[..., None], axis=-1)
+    gap = top - values
+    simple = gap > 1e-6 * jnp.abs(top)
     turned = jnp.einsum("...ij,...j->...i", tangents[0], largest)
-    along = jnp.einsum("...ik,...i->...k", vectors[..., :, :-1], turned)
+    along = jnp.einsum("...ik,...i->...k", vectors, turned)
     along = jnp.where(simple, along / jnp.where(simple, gap, 1), 0)
-    return largest, jnp.einsum("...ik,...k->...i", vectors[..., :, :-1], along)
+    return largest, jnp.einsum("...ik,...k->...i", vectors, along)
+
+
+def _column(matrix: Float[Array, "*n 4 4"], which: Int[Array, "*n"]) -> Float[Array, "*n 4"]:
+    return jnp.take_along_axis(matrix, which[..., None, None], axis=-1)[..., 0]
+
+
+def _eigh(matrix: Float[Array, "*n 4 4"]) -> tuple[Float[Array, "*n 4"], Float[Array, "*n 4 4"]]:
+    """Eigenvalues and eigenvectors (columns) of symmetric matrices, by Jacobi's cyclic rotations.
+
+    `jnp.linalg.eigh` calls LAPACK, which on a CPU waits for threads of the pool in which it runs: two programs that run
+    at the same time can stop for ever. After five sweeps the error is that of float32. (Golub and Van Loan, "Matrix
+    Computations", section 8.5)
+    """
+
+    def sweep(_: Int[Array, ""], parts: tuple[list, list]) -> tuple[list, list]:
+        a, v = parts
+        for p, q in ((0, 1), (2, 3), (0, 2), (1, 3), (0, 3), (1, 2)):
+            # The smaller root of the rotation's tangent, in a form that needs no division by a[p][q]
+            twice, apart = 2 * a[p][q], a[q][q] - a[p][p]
+            below = jnp.abs(apart) + jnp.sqrt(apart * apart + twice * twice)
+            tangent = jnp.where(apart < 0, -twice, twice) / jnp.where(below > 0, below, 1)
+            cos = jax.lax.rsqrt(1 + tangent * tangent)
+            sin = tangent * cos
+            a = _rotated(_transposed(_rotated(_transposed(a), p, q, cos, sin)), p, q, cos, sin)
+            v = _rotated(v, p, q, cos, sin)
+        return a, v
+
+    a = [[matrix[..., i, j] for j in range(4)] for i in range(4)]
+    v = [[jnp.full_like(a[0][0], i == j) for j in range(4)] for i in range(4)]
+    a, v = jax.lax.fori_loop(0, 5, sweep, (a, v))
+    return jnp.stack([a[i][i] for i in range(4)], axis=-1), jnp.stack([jnp.stack(row, axis=-1) for row in v], axis=-2)
+
+
+def _rotated(rows: list[list[Array]], p: int, q: int, cos: Array, sin: Array) -> list[list[Array]]:
+    """Rotate the columns p and q of a matrix, given by its numbers."""
+    turned = [list(row) for row in rows]
+    for row, new in zip(rows, turned, strict=True):
+        new[p], new[q] = cos * row[p] - sin * row[q], sin * row[p] + cos * row[q]
+    return turned
+
+
+def _transposed(rows: list[list[Array]]) -> list[list[Array]]:
+    return [list(column) for column in zip(*rows, strict=True)]
 
 
 @checked

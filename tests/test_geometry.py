@@ -77,7 +77,7 @@ def test_quaternion_of_any_matrix_is_the_nearest_rotation():
     assert np.all(quat[:, 0] >= 0)
     values = np.linalg.svd(matrix, compute_uv=False)
     clear = values[:, 1] - values[:, 2] > 0.05  # otherwise two rotations may be equally near
-    np.testing.assert_allclose(geometry.quat_to_matrix(quat)[clear], (left @ right)[clear], atol=2e-4)
+    np.testing.assert_allclose(geometry.quat_to_matrix(quat)[clear], (left @ right)[clear], atol=2e-5)
 
 
 @pytest.mark.parametrize("vector", [(0.0, 0.0, 0.0), (1e-4, 0.0, -2e-4), (0.3, -1.2, 2.5)])
