@@ -1,8 +1,10 @@
 """`Predictor`: a trained model as a function that predicts the last frame of a trajectory from the first frame."""
 
 import dataclasses
+import functools
 import importlib.resources
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,6 +24,10 @@ _QUAT_TOLERANCE = 1e-2  # largest deviation of a quaternion's length from 1
 _FARTHEST = 10.0  # m, largest coordinate of a position. A larger number is probably in millimetres
 _LARGEST_CONDITION = 100.0  # largest condition, as a multiple of its usual magnitude
 
+# Most items that one compiled program predicts: on a CPU, where a larger batch is not faster, it limits the memory.
+_CHUNK = {"cpu": 16}
+_PER_ITEM = ("mean", "log_var", "outcome_probability")  # the same for all samples of an item
+
 Images = Num[Array | np.ndarray, "*n h w 3"]
 Poses = Num[Array | np.ndarray, "*n 7"]
 Numbers = Num[Array | np.ndarray, "*n c"]
@@ -33,8 +39,8 @@ class Predictor:
 
     The prediction is the last frame, in which the object has come to rest. `Predictor.load("freefall")` loads a model
     that comes with the library, and `Predictor.load("runs/freefall/models/statespace")` one that you trained. Calls are
-    pure, and work inside `jax.jit`, `jax.vmap` and `jax.grad`. On a CPU, predict large batches in one thread only. With
-    JAX 0.10.1, two simultaneous calls, each with a batch of 60 images, never returned.
+    pure, work inside `jax.jit`, `jax.vmap` and `jax.grad`, and may run in several threads. The prediction of an item
+    does not depend on the other items of its batch. Outside `jax.jit`, the memory does not grow with the batch.
     """
 
     def __init__(
@@ -145,7 +151,7 @@ class Predictor:
         state: Num[Array | np.ndarray, "*n code"] | None = None,
         measurements: Mapping[str, ArrayLike | None] | None = None,
         present: Mapping[str, ArrayLike] | None = None,
-        key: Key[Array, ""] | None = None,
+        key: Key[Array, "*n"] | None = None,
         num_samples: int = 0,
     ) -> Prediction:
         """Predict the last frame of trajectories from their first frames.
@@ -164,7 +170,8 @@ class Predictor:
                 or images in [0, 1], (*n, height, width, channels).
             present: Masks by the name of the input, False for items in which it is to be ignored. Ignored values may be
                 NaN. By default, all items are used.
-            key: Random key that draws the samples. It is needed only if `num_samples` > 0.
+            key: Random key that draws the samples, needed only if `num_samples` > 0. With one key, equal items get
+                equal samples. With a key for each item, such as `jax.random.split(key, n)`, their samples differ.
             num_samples: Number of predictions to draw for each item, returned in `Prediction.samples`.
         """
         every = {"visual": visual, "tactile": tactile, "pose": pose, "state": state, **(measurements or {})}
@@ -177,6 +184,8 @@ class Predictor:
             raise ValueError(f"the leading axes differ: {leads}. Pass arrays with the same leading axes.")
         if num_samples < 0 or (num_samples and key is None):
             raise ValueError(f"num_samples={num_samples} and key={key}: give num_samples >= 0, and a key if it is > 0.")
+        if key is not None and key.shape not in ((), lead):
+            raise ValueError(f"key has shape {key.shape}: give one key, or keys of shape {lead}, one for each item.")
         masks = {name: _array(mask) for name, mask in (present or {}).items()}
         for name, mask in masks.items():
             if name not in inputs or mask.shape != lead or mask.dtype != bool:
@@ -208,17 +217,26 @@ class Predictor:
         key: Array | None,
         num_samples: int,
     ) -> Prediction:
-        model, view = self.model, self.preprocessing
         condition, fine = self._condition(condition, lead)
-        graphdef, state = model.graphdef, model.state
-        shared = condition, key if num_samples else None, num_samples, lead
-        if isinstance(model.config, mvae.Config):
-            result = predict(graphdef, state, view, self._empty["tactile"], inputs, present, *shared)
-        else:
+        given = inputs, present, condition, key if key is not None and key.ndim else None
+
+        def run(given: tuple, lead: tuple[int, ...]) -> Prediction:
+            inputs, present, condition, keys = given
+            model, view = self.model, self.preprocessing
+            graphdef, state, shared = model.graphdef, model.state, (condition, key if keys is None else keys)
+            if isinstance(model.config, mvae.Config):
+                blank = self._empty["tactile"]
+                return predict(graphdef, state, view, blank, inputs, present, *shared, num_samples, lead)
             inputs, present = completed(self._inputs, view.resolution, inputs, present, lead)
-            result = predict_samples(
-                graphdef, state, view, self._empty, inputs, present, *shared, calibration=model.calibration
-            )
+            more = *shared, num_samples, lead, model.calibration
+            return predict_samples(graphdef, state, view, self._empty, inputs, present, *more)
+
+        chunk, count = _CHUNK.get(jax.default_backend(), 256), math.prod(lead)
+        if count <= chunk or any(map(_traced, jax.tree.leaves((given, key)))):
+            result = run(given, lead)
+        else:
+            flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(lead) :]), given)
+            result = _joined([run(part, (chunk,)) for part in _cut(flat, chunk, count)], lead)
         valid = valid if fine is None else [*valid, fine]
         return flagged(result, jnp.all(jnp.stack(valid), axis=0)) if valid else result
 
@@ -288,6 +306,33 @@ class Predictor:
                 "numbers in SI units."
             )
         return condition, None
+
+
+def _cut(given: Any, chunk: int, count: int) -> Iterator[Any]:
+    """Cut the arrays of a batch of `count` items into chunks. Copies of the last item fill the last one."""
+    for start in range(0, count, chunk):
+        rows = np.minimum(np.arange(start, start + chunk), count - 1)
+        yield jax.tree.map(lambda x, rows=rows: x[rows], given)
+
+
+def _joined(parts: list[Prediction], lead: tuple[int, ...], *, axis: int = 0) -> Prediction:
+    """Concatenate the predictions of chunks without the filling, and give them the leading axes `lead`.
+
+    The items are on the first axis, or on `axis` of the arrays that have further axes in front of them in samples.
+    """
+
+    def joined(axis: int, *leaves: Array) -> Array:
+        leaf = jnp.concatenate(leaves, axis)
+        kept = jax.lax.slice_in_dim(leaf, 0, math.prod(lead), axis=axis)
+        return kept.reshape(*leaf.shape[:axis], *lead, *leaf.shape[axis + 1 :])
+
+    drawn = [part.samples for part in parts if part.samples is not None]
+    merged = {
+        name: jax.tree.map(functools.partial(joined, 0 if name in _PER_ITEM else axis), *leaves)
+        for name in Prediction._fields
+        if name != "samples" and (leaves := [getattr(part, name) for part in parts])
+    }
+    return Prediction(**merged, samples=_joined(drawn, lead, axis=1) if drawn else None)
 
 
 def _traced(value: object) -> bool:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from sts_jax import mvae, statespace, training
 
@@ -53,7 +53,7 @@ def predict(
     inputs: dict[str, Float[Array, "..."]],
     present: dict[str, Bool[Array, "*n"]],
     condition: Float[Array, "..."] | None = None,
-    key: PRNGKeyArray | None = None,
+    key: Key[Array, "*n"] | None = None,
     num_samples: int = 0,
     lead: tuple[int, ...] = (),
 ) -> Prediction:
@@ -65,7 +65,7 @@ def predict(
         inputs: Inputs by name: images in [0, 1], poses (*n, 7), vectors in SI units. Any may be missing.
         present: Masks (*n,) by name. An input without a mask is used for all items.
         condition: Conditions in SI units, (*n, c), or None.
-        key: Random key for the samples. If it is None, no samples are drawn.
+        key: Random key for the samples, one for all items or one for each. If it is None, no samples are drawn.
         num_samples: Number of samples to draw from the posterior and to decode.
         lead: Leading axes *n. Without inputs, the prediction is made from the prior.
     """
@@ -94,7 +94,9 @@ def predict(
 
     result = decode(posterior.mean, lead)
     if num_samples and key is not None:
-        noise = jax.random.normal(key, (num_samples, *posterior.mean.shape))
+        number, latent = posterior.mean.shape
+        keys = jnp.broadcast_to(key.reshape(-1), number)
+        noise = jax.vmap(lambda key: jax.random.normal(key, (num_samples, latent)), out_axes=1)(keys)
         z = posterior.mean[None] + jnp.exp(0.5 * posterior.log_var)[None] * noise
         result = result._replace(samples=decode(z, (num_samples, *lead)))
     return result
@@ -109,7 +111,7 @@ def predict_samples(
     inputs: dict[str, Float[Array, "..."]],
     present: dict[str, Bool[Array, "*n"]],
     condition: Float[Array, "..."] | None = None,
-    key: PRNGKeyArray | None = None,
+    key: Key[Array, "*n"] | None = None,
     num_samples: int = 0,
     lead: tuple[int, ...] = (),
     calibration: statespace.Calibration | None = None,
@@ -123,7 +125,8 @@ def predict_samples(
     Args:
         empty: Images "visual" and "tactile" of the empty sensor in [0, 1].
         inputs: All inputs of the model by name, see `completed`, and optionally the state codes "state".
-        key: Random key for the samples. None stands for `jax.random.key(0)`, so that every call gives the same result.
+        key: Random key for the samples, one for all items or one for each. None stands for `jax.random.key(0)`, so that
+            every call gives the same result.
         calibration: From `statespace.fit_calibration`. None for no correction and the default contrast.
 
     The other arguments are those of `predict`.
@@ -132,7 +135,7 @@ def predict_samples(
     if condition is not None:
         condition = preprocessing.encode_condition(condition).reshape(-1, condition.shape[-1])
     drawn = num_samples or _DRAWN
-    key = jax.random.key(0) if key is None else key
+    key = (jax.random.key(0) if key is None else key).reshape(-1)
     samples = statespace.sample(
         graphdef, state, key, flat, counts, empty, condition, calibration, num=max(_POSES, drawn), drawn=drawn
     )

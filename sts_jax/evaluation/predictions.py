@@ -157,9 +157,11 @@ def predict(
         """Predict in groups of equal size, to limit the memory. Copies of the last trajectory fill the last group."""
         count = len(pairs.object)
         size, parts = min(count, _CHUNK), []
-        for number, start in enumerate(range(0, count, size)):
+        keys = jax.random.split(jax.random.key(0), count) if num_samples else None
+        for start in range(0, count, size):
             rows = np.minimum(np.arange(start, start + size), count - 1)
-            parts.append(_predict_rows(predictor, names, pairs, rows, num_samples, number))
+            some = None if keys is None else keys[rows]
+            parts.append(_predict_rows(predictor, names, pairs, rows, some, num_samples))
         return first(joined(parts), count)
 
     out = run(test, num_samples)
@@ -176,7 +178,7 @@ def predict(
 
 
 def _predict_rows(
-    predictor: Any, names: tuple[str, ...], pairs: Pairs, rows: np.ndarray, num_samples: int, seed: int
+    predictor: Any, names: tuple[str, ...], pairs: Pairs, rows: np.ndarray, key: Any, num_samples: int
 ) -> Predicted:
     """Predict the trajectories `rows` of `pairs` from the inputs `names`. The images of samples become `uint8`."""
     condition = pairs.condition[rows] if pairs.condition.shape[1] else None
@@ -193,7 +195,7 @@ def _predict_rows(
             pose=pairs.pose[rows, 0] if "pose" in names else None,
             condition=condition,
             state=state,
-            key=jax.random.key(seed) if num_samples else None,
+            key=key,
             num_samples=num_samples,
             **({"measurements": further, "present": masks} if further else {}),
         )

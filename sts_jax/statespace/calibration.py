@@ -111,8 +111,8 @@ def _energies(
     graphdef: nnx.GraphDef[Model], params: nnx.State, chunk: _Chunk, correction: Calibration
 ) -> Float[Array, "contrasts n"]:
     """Mean gradient energy of the samples of each item, for each of the contrasts."""
-    model, key = nnx.merge(graphdef, params), jax.random.key(0)
-    samples = draw(model, key, *chunk, correction, num=_SAMPLES, drawn=_SAMPLES)
+    model, keys = nnx.merge(graphdef, params), jax.random.split(jax.random.key(0), _CHUNK)
+    samples = draw(model, keys, *chunk, correction, num=_SAMPLES, drawn=_SAMPLES)
     energies = [
         gradient_energy(compose(samples.layers, samples.empty, samples.level, contrast)["visual"])
         for contrast in CONTRASTS

@@ -1,11 +1,12 @@
 """Predictions of a state-space model: the calibrated density of the final pose, and samples of poses and images."""
 
+import functools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from flax import nnx
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Key
 
 from sts_jax.mvae import Gaussian
 from sts_jax.statespace import poses, state
@@ -96,7 +97,7 @@ class Samples(NamedTuple):
 def sample(
     graphdef: nnx.GraphDef[Model],
     params: nnx.State,
-    key: PRNGKeyArray,
+    key: Key[Array, "*n"],
     inputs: dict[str, Array],
     present: dict[str, Bool[Array, "n"]],
     empty: dict[str, Float[Array, "size size 3"]],
@@ -109,6 +110,8 @@ def sample(
     """Sample final poses and images of the last frame, given inputs of the first frame.
 
     Args:
+        key: One random key for each item, `(n,)`, or one for all items. The samples of an item then depend neither on
+            its place in the batch nor on the other items.
         inputs: One or more inputs of n items, by name. `visual` and `tactile` are images in [0, 1], `(n, size, size,
             3)`, where size is `Config.input_size`. `pose` has pose codes, `(n, 12)`, and `state` true state codes, `(n,
             code)`.
@@ -151,7 +154,7 @@ class Drawn(NamedTuple):
 
 def draw(
     model: Model,
-    key: PRNGKeyArray,
+    key: Key[Array, "*n"],
     inputs: dict[str, Array],
     present: dict[str, Bool[Array, "n"]],
     empty: dict[str, Float[Array, "size size 3"]],
@@ -163,11 +166,13 @@ def draw(
 ) -> Drawn:
     """Sample final poses, and render layers for a part of them. The arguments after `model` are those of `sample`."""
     belief, final = predict(model, inputs, present, empty, condition, correction)
-    end, appearance, outline = jax.random.split(key, 3)
-    codes, turns = jax.vmap(lambda key: _final_pose(key, final))(jax.random.split(end, num))
+    keys = jnp.broadcast_to(key, len(belief.mean))
+    end, appearance, outline = jax.vmap(lambda key: jax.random.split(key, 3), out_axes=1)(keys)
+    codes, turns = jax.vmap(functools.partial(_final_poses, num=num), out_axes=1)(end, final)
     known = jnp.broadcast_to(belief.mean[:, : state.CODE], (drawn, len(belief.mean), state.CODE))
     mean, log_var = (x[:, state.CODE :] for x in belief)
-    looks = mean + jnp.exp(0.5 * log_var) * jax.random.normal(appearance, (drawn, *mean.shape))
+    noise = jax.vmap(lambda key: jax.random.normal(key, (drawn, mean.shape[1])), out_axes=1)(appearance)
+    looks = mean + jnp.exp(0.5 * log_var) * noise
     layers = model.decoder(
         codes[:drawn].reshape(-1, poses.CODE),
         turns[:drawn].reshape(-1, 3, 3),
@@ -177,24 +182,20 @@ def draw(
     shown = {name: reduced(x, model.config.image_size) for name, x in empty.items()}
     # An image is sharp because pixels are covered above a level of probability. The levels of an item are equally
     # spaced, in random order.
-    order = jax.vmap(lambda key: jax.random.permutation(key, drawn))(jax.random.split(outline, len(mean)))
-    level = (order.T.reshape(-1) + 0.5) / drawn
+    order = jax.vmap(lambda key: jax.random.permutation(key, drawn), out_axes=1)(outline)
+    level = (order.reshape(-1) + 0.5) / drawn
     return Drawn(belief, jnp.exp(final.outcome), codes, layers, level, shown)
 
 
-def _final_pose(key: PRNGKeyArray, final: FinalPose) -> tuple[Float[Array, "n 12"], Float[Array, "n 3 3"]]:
-    """Draw a final pose for each item. Return its code and the rotation matrix from the first to the final pose."""
+def _final_poses(
+    key: Key[Array, ""], final: FinalPose, *, num: int
+) -> tuple[Float[Array, "num 12"], Float[Array, "num 3 3"]]:
+    """Draw final poses of one item. Return their codes and the rotation matrices from the first to the final pose."""
     which, noise = jax.random.split(key)
-    number = len(final.outcome)
-    joint = (final.outcome[:, :, None] + final.weight).reshape(number, -1)
-    chosen = jax.random.categorical(which, joint)
-
-    def of_chosen(x: Array) -> Array:
-        flat = x.reshape(number, -1, poses.MOVE)
-        return jnp.take_along_axis(flat, chosen[:, None, None], axis=1)[:, 0]
-
-    mean, log_var = of_chosen(final.mean), of_chosen(final.log_var)
+    joint = (final.outcome[:, None] + final.weight).reshape(-1)
+    chosen = jax.random.categorical(which, joint, shape=(num,))
+    mean, log_var = (x.reshape(-1, poses.MOVE)[chosen] for x in (final.mean, final.log_var))
     move = mean + jnp.exp(0.5 * log_var) * jax.random.normal(noise, mean.shape)
     heading = poses.about_vertical(final.heading)
-    turn = heading @ poses.nearest(move[:, poses.CODE :]) @ jnp.swapaxes(heading, -1, -2)
+    turn = heading @ poses.nearest(move[:, poses.CODE :]) @ heading.T
     return poses.turn_code(final.heading, poses.rigid(move[:, : poses.CODE])), turn
