@@ -121,6 +121,17 @@ def test_async_read_returns_every_frame_in_order_and_without_a_buffer_the_newest
         assert wait_until(lambda: camera.statistics.skipped > 5)
 
 
+def test_read_latest_returns_the_newest_frame_at_once_unless_it_is_old(server):
+    with connected(server, buffer=50, timeout_s=0.5) as camera:
+        camera.read()
+        time.sleep(0.3)
+        newest = camera.read_latest()
+        assert camera.read_latest(max_age_ms=1000).sequence >= newest.sequence
+        assert camera.async_read().sequence < newest.sequence  # the queue is as before
+        with pytest.raises(CameraTimeoutError, match="more than max_age_ms=0"):
+            camera.read_latest(max_age_ms=0)
+
+
 def test_images_are_rgb_and_read_only():
     server = MotionJpeg(colour=(0, 0, 255))  # red for OpenCV
     with connected(server) as camera:
@@ -237,7 +248,7 @@ def test_a_camera_connects_again_after_disconnect(server):
         camera.disconnect()
         camera.disconnect()
         assert not camera.is_connected
-        for call in (camera.read, camera.async_read):
+        for call in (camera.read, camera.async_read, camera.read_latest):
             with pytest.raises(CameraError, match=r"call connect\(\)"):
                 call()
 

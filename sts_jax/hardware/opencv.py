@@ -192,6 +192,19 @@ class OpenCVCamera:
         with self._changed:
             return self._wait(timeout_ms, lambda frame: True)
 
+    def read_latest(self, max_age_ms: float = 500.0) -> Captured:
+        """Return the newest frame without waiting. The same frame may be returned several times."""
+        with self._changed:
+            frame = self._newest
+            if frame is None or self._problem is not None or self._stop.is_set():
+                raise self._error(0.0)
+        age_ms = 1000 * (time.monotonic() - frame.time_s)
+        if age_ms > max_age_ms:
+            raise CameraTimeoutError(
+                f"the newest frame of {self.config.name} is {age_ms:.0f} ms old, more than max_age_ms={max_age_ms:g}."
+            )
+        return frame
+
     def _wait(self, timeout_ms: float | None, wanted: Callable[[Captured], bool]) -> Captured:
         """Return the next wanted frame of the queue, and discard those before it."""
         limit_s = self.config.timeout_s if timeout_ms is None else timeout_ms / 1000
