@@ -151,7 +151,7 @@ class Predictor:
         state: Num[Array | np.ndarray, "*n code"] | None = None,
         measurements: Mapping[str, ArrayLike | None] | None = None,
         present: Mapping[str, ArrayLike] | None = None,
-        key: Key[Array, "*n"] | None = None,
+        key: Key[Array, "..."] | None = None,
         num_samples: int = 0,
     ) -> Prediction:
         """Predict the last frame of trajectories from their first frames.

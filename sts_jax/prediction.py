@@ -53,7 +53,7 @@ def predict(
     inputs: dict[str, Float[Array, "..."]],
     present: dict[str, Bool[Array, "*n"]],
     condition: Float[Array, "..."] | None = None,
-    key: Key[Array, "*n"] | None = None,
+    key: Key[Array, "..."] | None = None,
     num_samples: int = 0,
     lead: tuple[int, ...] = (),
 ) -> Prediction:
@@ -111,7 +111,7 @@ def predict_samples(
     inputs: dict[str, Float[Array, "..."]],
     present: dict[str, Bool[Array, "*n"]],
     condition: Float[Array, "..."] | None = None,
-    key: Key[Array, "*n"] | None = None,
+    key: Key[Array, "..."] | None = None,
     num_samples: int = 0,
     lead: tuple[int, ...] = (),
     calibration: statespace.Calibration | None = None,

@@ -73,6 +73,32 @@ def test_any_subset_and_any_leading_axes(predictor, names):
         np.testing.assert_allclose(alone.visual, out.visual[(0,) * len(lead)], atol=1e-5)
 
 
+@pytest.mark.parametrize("kind", ["mvae", "statespace"])
+def test_a_prediction_depends_neither_on_its_place_nor_on_the_batch(request, kind):
+    predictor = request.getfixturevalue("predictor" if kind == "mvae" else "state_predictor")
+    given = {name: np.repeat(value[[0, 1]], 10, axis=0) for name, value in measurement(2).items()}  # more than a chunk
+    if kind == "statespace":
+        given["condition"] = np.repeat(CONDITION, 10, axis=0)
+    known = {"key": jax.random.key(3), "num_samples": 4}
+
+    def item(prediction, i):
+        samples = [np.asarray(x)[:, i] for x in prediction.samples[:3]]
+        return jax.tree.map(lambda x: x[i], prediction._replace(samples=None)), samples
+
+    out = predictor(**given, **known)
+    for i in range(1, 10):
+        same(item(out, i), item(out, 0))
+    alone = predictor(**{name: value[0] for name, value in given.items()}, **known)
+    close(item(out, 0), (alone._replace(samples=None), list(alone.samples[:3])), atol=1e-4)
+    wide = predictor(**{name: x.reshape(4, 5, *x.shape[1:]) for name, x in given.items()}, **known)
+    assert wide.samples.pose.shape == (4, 4, 5, 7)
+    same(jax.tree.map(lambda x: x.reshape(20, *x.shape[2:]), wide._replace(samples=None)), out._replace(samples=None))
+    several = predictor(**given, **{**known, "key": jax.random.split(known["key"], 20)}).samples.pose
+    assert np.abs(several[:, 1] - several[:, 0]).max() > 1e-3  # keys of their own give samples of their own
+    with pytest.raises(ValueError, match=r"key has shape \(3,\)"):
+        predictor(**given, **{**known, "key": jax.random.split(known["key"], 3)})
+
+
 def test_masked_and_untouched_items_fall_back_on_the_rest(predictor):
     given = measurement(3)
     given["visual"][1] = np.nan

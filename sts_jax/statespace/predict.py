@@ -97,7 +97,7 @@ class Samples(NamedTuple):
 def sample(
     graphdef: nnx.GraphDef[Model],
     params: nnx.State,
-    key: Key[Array, "*n"],
+    key: Key[Array, "..."],
     inputs: dict[str, Array],
     present: dict[str, Bool[Array, "n"]],
     empty: dict[str, Float[Array, "size size 3"]],
@@ -154,7 +154,7 @@ class Drawn(NamedTuple):
 
 def draw(
     model: Model,
-    key: Key[Array, "*n"],
+    key: Key[Array, "..."],
     inputs: dict[str, Array],
     present: dict[str, Bool[Array, "n"]],
     empty: dict[str, Float[Array, "size size 3"]],
