@@ -1,8 +1,10 @@
-"""Run-time checks of arguments at the public entry points, and of arrays that were read from files."""
+"""Run-time checks of arguments at the public entry points and of arrays from files, and the settings of JAX."""
 
+import contextlib
+import functools
 import typing
-from collections.abc import Collection, Iterator, Mapping
-from typing import Any
+from collections.abc import Callable, Collection, Iterator, Mapping
+from typing import Any, ParamSpec, TypeVar
 
 import jax
 import numpy as np
@@ -11,6 +13,45 @@ from jaxtyping import jaxtyped
 
 # Check array shapes and argument types by the annotations. An int is accepted for a float (PEP 484).
 checked = jaxtyped(typechecker=beartype(conf=BeartypeConf(is_pep484_tower=True)))
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def in_32_bits(function: Callable[P, R]) -> Callable[P, R]:
+    """Run a function in 32 bits and with JAX's usual promotion of types and ranks, whatever the user has set.
+
+    64-bit arrays are rounded. The settings hold for one thread, so a function that a pool runs needs the decorator too.
+    """
+
+    @functools.wraps(function)
+    def run(*args: P.args, **kwargs: P.kwargs) -> R:
+        if _settings() == (False, "standard", "allow"):
+            return function(*args, **kwargs)
+        args, kwargs = jax.tree.map(_rounded, (args, kwargs))
+        with settings(False):
+            return function(*args, **kwargs)
+
+    return run
+
+
+def _settings() -> tuple[bool, str, str]:
+    config = jax.config
+    return config.jax_enable_x64, config.jax_numpy_dtype_promotion, config.jax_numpy_rank_promotion
+
+
+@contextlib.contextmanager
+def settings(x64: bool) -> Iterator[None]:
+    """JAX's usual promotion, and 64 bits or not."""
+    with jax.enable_x64(x64), jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        yield
+
+
+def _rounded(leaf: Any) -> Any:
+    """A 64-bit array in 32 bits."""
+    if isinstance(leaf, jax.Array) and leaf.dtype in ("float64", "int64", "uint64", "complex128"):
+        return leaf.astype(str(leaf.dtype).replace("64", "32").replace("128", "64"))
+    return leaf
 
 
 def check_key(key: Any) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Real
 
 from sts_jax import optics
-from sts_jax._checked import checked
+from sts_jax._checked import checked, in_32_bits
 from sts_jax._ranges import MOST_PIXELS
 from sts_jax.objects.body import FACE_CLASSES, Body, is_traced
 from sts_jax.rendering import drawing, equilibrium
@@ -53,6 +53,7 @@ class Frame:
         return f"Frame({size}, object in {seen:.1%} of the view, {pressed}, {balance})"
 
 
+@in_32_bits
 @checked
 def sense(
     sensor: Sensor,
@@ -120,6 +121,7 @@ def sense(
     )
 
 
+@in_32_bits
 @checked
 def expose(sensor: Sensor, frame: Frame, light: Real[ArrayLike, ""]) -> Float[Array, "*n h w 3"]:
     """Render a frame with the internal light at any level between off and full, as a mixture in linear light.
@@ -149,6 +151,7 @@ def expose(sensor: Sensor, frame: Frame, light: Real[ArrayLike, ""]) -> Float[Ar
     return jnp.clip(mixed + jax.lax.stop_gradient(ends), 0, 1)
 
 
+@in_32_bits
 @checked
 def touch(
     sensor: Sensor, imprint: Float[ArrayLike, "h w"], window: Float[ArrayLike, "4"] | None = None

@@ -15,7 +15,7 @@ from flax import nnx
 from jaxtyping import Array, ArrayLike, Bool, Key, Num
 
 from sts_jax import mvae, statespace, storage, training
-from sts_jax._checked import checked
+from sts_jax._checked import checked, in_32_bits
 from sts_jax.prediction import Prediction, completed, flagged, predict, predict_samples
 
 MODALITIES = ("visual", "tactile", "pose")
@@ -82,6 +82,7 @@ class Predictor:
         self._empty = dict(zip(("visual", "tactile"), images, strict=True))
 
     @classmethod
+    @in_32_bits
     def load(cls, folder: str | Path) -> "Predictor":
         """Load a trained model, after comparing its files with their checksums.
 
@@ -114,6 +115,7 @@ class Predictor:
             )
         return cls(model, preprocessing, blank, str(folder))
 
+    @in_32_bits
     def save(self, folder: str | Path, *, compact: bool = False) -> None:
         """Write the model to a folder that `load` reads. It has no optimiser's state, so training cannot resume there.
 
@@ -140,6 +142,7 @@ class Predictor:
             f"steps={self.model.step})"
         )
 
+    @in_32_bits
     @checked
     def __call__(
         self,
@@ -202,6 +205,7 @@ class Predictor:
                 raise ValueError(_reason(name, self._kinds[name], np.asarray(array)[~(fine | ignored)]))
         return self._predicted(inputs, masks, lead, condition, valid, key, num_samples)
 
+    @in_32_bits
     @checked
     def prior(self, shape: tuple[int, ...] = (), *, condition: Numbers | None = None) -> Prediction:
         """Predict last frames from the model's prior distribution, for leading axes `shape`. Condition as in a call."""

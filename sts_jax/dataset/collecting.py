@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from sts_jax import objects, physics
+from sts_jax._checked import in_32_bits
 from sts_jax.dataset import records
 from sts_jax.dataset.collection import Collection, as_json, class_names, make_bodies, split_objects
 from sts_jax.dataset.rendering import render
@@ -34,6 +35,7 @@ class Progress(NamedTuple):
     stage: str  # "trajectories" for the simulation, "frames" for the rendering
 
 
+@in_32_bits
 def collect(
     collection: Collection,
     sensor: Sensor,

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from sts_jax import objects, physics
+from sts_jax._checked import in_32_bits
 from sts_jax._ranges import COUNT, MOST_PIXELS, NUMBER
 from sts_jax._ranges import check as check_ranges
 from sts_jax.dataset import records
@@ -95,6 +96,7 @@ def class_names(collection: Collection) -> tuple[str, ...]:
     return tuple(collection.categories[i % len(collection.categories)] for i in range(collection.num_objects))
 
 
+@in_32_bits
 def make_bodies(collection: Collection, indices: np.ndarray) -> list[objects.Body]:
     """Make the objects of a collection with the given indices, int `(n,)`. Each depends on its own index only."""
     if collection.meshes is not None:

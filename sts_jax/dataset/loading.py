@@ -13,7 +13,7 @@ import pydantic
 from jaxtyping import Float, Int
 
 from sts_jax import geometry, physics
-from sts_jax._checked import check_arrays
+from sts_jax._checked import check_arrays, in_32_bits
 from sts_jax.dataset import records
 from sts_jax.dataset.measurement import Measurement, measured
 from sts_jax.storage import DamagedFileError, Finite, decode, digest, read_arrays, read_fields, read_json, verify
@@ -77,6 +77,7 @@ def reduced(pairs: Pairs, size: int) -> Pairs:
     return pairs._replace(visual=small["visual"], tactile=small["tactile"], segmentation=small["segmentation"][..., 0])
 
 
+@in_32_bits
 def reduced_images(images: dict[str, np.ndarray], size: int) -> dict[str, np.ndarray]:
     """Reduce square images `(*n, side, side, channels)` to `size` pixels, each the mean of a square block of pixels.
 

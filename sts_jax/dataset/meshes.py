@@ -11,6 +11,7 @@ import numpy as np
 from scipy import spatial
 
 from sts_jax import objects, physics
+from sts_jax._checked import in_32_bits
 
 SAME = 1e-5  # m, largest distance between triangles of one mesh in two file formats, which round differently
 
@@ -29,6 +30,7 @@ class Meshes:
     up: Literal["x", "y", "z"] | None = None  # axis of the files that becomes +z, None as in `survey_meshes`
 
 
+@in_32_bits
 def survey_meshes(
     folder: str | os.PathLike[str],
     scenario: physics.Scenario,

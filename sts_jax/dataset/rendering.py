@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, UInt8
 
 from sts_jax import geometry, objects, physics
+from sts_jax._checked import in_32_bits
 from sts_jax.dataset import records
 from sts_jax.dataset.collection import Collection, make_bodies
 from sts_jax.frame import sense
@@ -84,6 +85,7 @@ def frames_per_call() -> int:
     return CPU_RENDER_BATCH if jax.default_backend() == "cpu" else RENDER_BATCH
 
 
+@in_32_bits
 @functools.partial(jax.jit, static_argnames=("resolution", "crop"))
 def render_uint8(
     sensor: Sensor,
@@ -105,6 +107,7 @@ def render_uint8(
     return jax.lax.map(one, (pose, wrench), batch_size=1 if jax.default_backend() == "cpu" else len(pose))
 
 
+@in_32_bits
 def empty_frame(sensor: Sensor, collection: Collection) -> records.Images:
     """Render the sensor without an object in the resolution of a collection, without a leading axis."""
     body = make_bodies(collection, np.array([0]))[0]

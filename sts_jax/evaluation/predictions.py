@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sts_jax import physics, training
+from sts_jax._checked import in_32_bits
 from sts_jax.dataset import Dataset, Pairs
 from sts_jax.dataset.measurement import NAMES
 from sts_jax.evaluation.metrics import best_threshold
@@ -117,6 +118,7 @@ def subsets(modalities: Sequence[str], *, state: bool = False) -> dict[str, tupl
     return described
 
 
+@in_32_bits
 def predict(
     predictor: Any,
     inputs: Sequence[str],

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from sts_jax import dataset, physics
+from sts_jax._checked import in_32_bits
 from sts_jax.dataset import Pairs
 from sts_jax.evaluation import metrics
 from sts_jax.evaluation.predictions import Predicted, in_unit, outcome_of_pose, shares
@@ -40,6 +41,7 @@ def image_baselines(train: Streams, test: Streams) -> dict[str, Predicted]:
     return _images(train, test, _distance(train, test).argmin(1))
 
 
+@in_32_bits
 def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str, Predicted]:
     """Predict the last frame without a trained model, in four ways.
 
@@ -137,6 +139,7 @@ def _mean(values: np.ndarray) -> np.ndarray:
     return measured.mean(0) if len(measured) else np.full(values.shape[1:], np.nan)
 
 
+@in_32_bits
 def ceiling(
     collection: dataset.Collection,
     sensor: Sensor,
@@ -234,6 +237,6 @@ def _render(
     shape = collection.resolution if same else (size, size)
     visual, tactile = (np.empty((len(owner), *shape, 3), np.uint8) for _ in range(2))
     with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
-        for rows, parts in zip(jobs, pool.map(work, jobs), strict=True):
+        for rows, parts in zip(jobs, pool.map(in_32_bits(work), jobs), strict=True):
             visual[rows], tactile[rows] = parts
     return visual, tactile

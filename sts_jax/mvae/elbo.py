@@ -22,6 +22,7 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from sts_jax._checked import in_32_bits
 from sts_jax.mvae.gaussian import Gaussian, kl_standard_normal, product_of_experts
 from sts_jax.mvae.networks import MVAE, Config, Modality
 
@@ -59,6 +60,7 @@ def _groups(config: Config, asked: Literal["all", "own"], absent: tuple[str, ...
     return [g for g in groups.values() if g.members or empty or not kept]
 
 
+@in_32_bits
 def loss(
     graphdef: nnx.GraphDef[MVAE],
     params: nnx.State,
@@ -133,6 +135,7 @@ def loss(
     return total, (nnx.state(model, nnx.BatchStat), Terms(total, kl / jnp.sum(subsets), reconstruction))
 
 
+@in_32_bits
 def infer(
     graphdef: nnx.GraphDef[MVAE],
     state: nnx.State,
@@ -159,6 +162,7 @@ def infer(
     return product_of_experts(*_experts(model, inputs, present or {}, absent, batch, training=False))
 
 
+@in_32_bits
 def decode(
     graphdef: nnx.GraphDef[MVAE],
     state: nnx.State,
@@ -183,6 +187,7 @@ def decode(
     }
 
 
+@in_32_bits
 def predict(
     graphdef: nnx.GraphDef[MVAE],
     state: nnx.State,

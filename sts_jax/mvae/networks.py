@@ -17,6 +17,7 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from sts_jax._checked import in_32_bits
 from sts_jax.mvae.convolutions import conv, conv_transpose
 from sts_jax.mvae.gaussian import Gaussian
 
@@ -234,6 +235,7 @@ class MVAE(nnx.Module):
         self.decoders = nnx.Dict({m.name: decoders[m.kind](m, config) for m in config.modalities})
 
 
+@in_32_bits
 def init(key: PRNGKeyArray, config: Config) -> tuple[nnx.GraphDef[MVAE], nnx.State, nnx.State]:
     """Create a model with random parameters: its definition, parameters and running batch statistics.
 

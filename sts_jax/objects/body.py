@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, ScalarLike
 
+from sts_jax._checked import in_32_bits
+
 # Size classes, to which the arrays of a body are padded. Two bodies of the same classes have arrays of equal shapes, so
 # they share compiled programs. A padding face is (0, 0, 0), so it has no area and covers no pixel. Padding vertices and
 # padding hulls repeat the last one, so that extents need no mask. There are as many vertices as faces. A padding
@@ -140,6 +142,7 @@ def stack(bodies: Sequence[Body]) -> Body:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *bodies)
 
 
+@in_32_bits
 def mirror(body: Body) -> Body:
     """Mirror a body, or every body in a result of `stack`, by changing the sign of all y coordinates."""
     flip = jnp.array([1.0, -1, 1])
@@ -159,6 +162,7 @@ def mirror(body: Body) -> Body:
     )
 
 
+@in_32_bits
 def rigid(
     body: Body, fill: ScalarLike, shell_scale: ScalarLike, up: Direction = (0.0, 0.0, 1.0)
 ) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3 3"]]:
@@ -207,6 +211,7 @@ class _Bracket(NamedTuple):
     high: Array
 
 
+@in_32_bits
 def fill_moments(
     interior: Float[Array, "i 3 3"], fill: ScalarLike, up: Direction = (0.0, 0.0, 1.0)
 ) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3 3"]]:

@@ -1,8 +1,10 @@
 """A folder of mesh files: `Item` (one file), `Library` (all items), `Entry` (a loaded item), and a cache of bodies."""
 
 import dataclasses
+import functools
 import hashlib
 import json
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -88,10 +90,18 @@ def cache_path(library: Library, item: Item) -> Path:
 
 
 def write_cached(path: Path, entry: Entry) -> None:
-    """Write the body of an item to a file of the cache, atomically."""
+    """Write the body of an item to a file of the cache, atomically, with a warning if the cache cannot be written."""
     about = json.dumps({"gaps": entry.gaps, "notes": entry.notes, "length": entry.length})
     leaves: dict[str, Any] = {field.name: getattr(entry.body, field.name) for field in dataclasses.fields(Body)}
-    write_arrays(path, {"about": np.frombuffer(about.encode(), np.uint8), **leaves})
+    try:
+        write_arrays(path, {"about": np.frombuffer(about.encode(), np.uint8), **leaves})
+    except OSError as error:
+        _warn_once(f"objects are not kept, because {path.parent} cannot be written ({error.__cause__})")
+
+
+@functools.cache  # `load` resets Python's own memory of warnings
+def _warn_once(text: str) -> None:
+    warnings.warn(text, stacklevel=4)
 
 
 def read_cached(path: Path, item: Item) -> Entry | None:

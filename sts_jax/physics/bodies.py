@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sts_jax import objects
+from sts_jax._checked import in_32_bits
 from sts_jax.objects.body import Body
 from sts_jax.physics import contact
 from sts_jax.physics.contact import Hull
@@ -74,6 +75,7 @@ class Rigid(NamedTuple):
     friction: Float[np.ndarray, "n"]  # Coefficient of sliding friction against the pad.
 
 
+@in_32_bits
 def rigids(bodies: Sequence[Body], which: Int[np.ndarray, "n"], hidden: Hidden) -> Rigid:
     """Mass properties and friction of bodies with n sets of hidden properties (see `objects.rigid`).
 
@@ -92,7 +94,7 @@ def rigids(bodies: Sequence[Body], which: Int[np.ndarray, "n"], hidden: Hidden) 
     # A call uses one core of a CPU. The first call compiles.
     parts = [computed(rows) for rows in calls[:1]]
     with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
-        parts += pool.map(computed, calls[1:])
+        parts += pool.map(in_32_bits(computed), calls[1:])
     return Rigid(*(np.concatenate(leaves).astype(np.float64) for leaves in zip(*parts, strict=True)))
 
 

@@ -9,13 +9,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sts_jax import geometry
-from sts_jax._checked import checked
+from sts_jax._checked import checked, in_32_bits
 from sts_jax.objects.body import is_traced
 from sts_jax.physics.scene import mjx
 
 from mujoco.mjx._src import support  # isort: skip  (after `scene`, which imports MJX silently)
 
 
+@in_32_bits
 @checked
 def wrench(
     model: mujoco.MjModel | mjx.Model,

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, ScalarLike
 from scipy.spatial.transform import Rotation
 
 from sts_jax import geometry, objects, tactile
+from sts_jax._checked import in_32_bits
 from sts_jax.objects import Body
 from sts_jax.objects.body import is_traced
 from sts_jax.physics.scenario import STANDING, G
@@ -39,6 +40,7 @@ class Placement(NamedTuple):
     wrench: Float[Array, "6"]  # Force (N) and moment about the sensor's origin (N m) of the pad on the body.
 
 
+@in_32_bits
 def stable_faces(
     body: Body,
     *,
@@ -72,6 +74,7 @@ def stable_faces(
     return StableFaces(ups[order], shares[order])
 
 
+@in_32_bits
 def weight(
     body: Body,
     pose: Float[Array | np.ndarray, "7"],
@@ -92,6 +95,7 @@ def weight(
     return G * mass * jnp.stack([zero, zero, zero + 1, y, -x, zero])
 
 
+@in_32_bits
 def place(
     body: Body,
     sensor: Sensor,

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 from tqdm import tqdm
 
-from sts_jax._checked import check_key
+from sts_jax._checked import check_key, in_32_bits
 from sts_jax.objects.body import Body, is_traced
 from sts_jax.physics.arguments import (
     check_arguments,
@@ -140,6 +140,7 @@ class _Accepted(NamedTuple):
     attempt: Int[np.ndarray, "n"]  # number of draws that failed before
 
 
+@in_32_bits
 def simulate(
     key: PRNGKeyArray,
     body: Body | Sequence[Body],
@@ -244,7 +245,7 @@ def _accepted(
         hidden = hidden if given.hidden is None else given.hidden
         chunks = _chunks(setup, pending, chunk, engine, workers)
         with concurrent.futures.ThreadPoolExecutor(workers) as pool:
-            results = pool.map(prepare(setup, starts, hidden, chunk), chunks)
+            results = pool.map(in_32_bits(prepare(setup, starts, hidden, chunk)), chunks)
             for indices, result in zip(chunks, results, strict=True):
                 for row, i in enumerate(indices.tolist()):
                     rows[i] = jax.tree.map(lambda x, row=row: x[row], result)
@@ -311,6 +312,7 @@ def _trajectory(setup: Setup, sensor: Sensor, accepted: _Accepted) -> Trajectory
     )
 
 
+@in_32_bits
 def starts(
     key: PRNGKeyArray, bodies: Body | Sequence[Body], sensor: Sensor, scenario: Scenario, num: int = 1
 ) -> Starts:

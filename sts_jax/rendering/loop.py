@@ -18,6 +18,8 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, ArrayLike
 
+from sts_jax._checked import settings
+
 Flat = Callable[..., list[Array]]
 
 
@@ -44,6 +46,7 @@ def looped(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def _looped(function: Flat) -> Flat:
     """`looped` for a function from arrays to a list of arrays."""
+    x64 = jax.config.jax_enable_x64  # of the first trace. JAX traces derivatives later, with the caller's settings
 
     # JAX passes flags and symbolic zeros in place of arrays. They would have the wrong type for the fields of the
     # caller's trees, so all functions below use lists of arrays.
@@ -70,7 +73,9 @@ def _looped(function: Flat) -> Flat:
             return [result for result, kept in zip(function(*leaves), real, strict=True) if kept]
 
         moving = [change for change, used in zip(changes, active, strict=True) if used]
-        rates = iter(_linear.bind(*leaves, *moving, function=reals, active=active, transposed=False) if moving else ())
+        rates = iter(
+            _linear.bind(*leaves, *moving, function=reals, active=active, transposed=False, x64=x64) if moving else ()
+        )
         slopes = [
             (next(rates) if moving else jnp.zeros_like(result)) if kept else np.zeros(result.shape, jax.dtypes.float0)
             for result, kept in zip(results, real, strict=True)
@@ -112,7 +117,12 @@ _linear = Primitive("looped_derivative")
 _linear.multiple_results = True
 
 
-def _apply(*operands: ArrayLike, function: Flat, active: tuple[bool, ...], transposed: bool) -> list[Array]:
+def _apply(*operands: ArrayLike, function: Flat, active: tuple[bool, ...], transposed: bool, x64: bool) -> list[Array]:
+    with settings(x64):
+        return _applied(operands, function, active, transposed)
+
+
+def _applied(operands: Sequence[ArrayLike], function: Flat, active: tuple[bool, ...], transposed: bool) -> list[Array]:
     arguments, vectors = operands[: len(active)], operands[len(active) :]
 
     def of_active(*moving: Array) -> list[Array]:

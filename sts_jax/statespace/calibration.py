@@ -23,6 +23,7 @@ from flax import nnx
 from jaxtyping import Array, Float, Int
 from scipy import optimize
 
+from sts_jax._checked import in_32_bits
 from sts_jax.statespace.networks import CONTRAST, FinalPose, Model, compose
 from sts_jax.statespace.objective import log_density, rotation_between
 from sts_jax.statespace.predict import Calibration, corrected, draw, predict
@@ -38,6 +39,7 @@ _PRIOR = 0.5  # standard deviation of the logarithms in the prior, which is a no
 _Chunk = tuple[dict[str, Any], dict[str, Any], dict[str, Any], Any]
 
 
+@in_32_bits
 def fit(
     graphdef: nnx.GraphDef[Model],
     params: nnx.State,

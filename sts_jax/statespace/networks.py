@@ -19,6 +19,7 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from sts_jax import objects
+from sts_jax._checked import in_32_bits
 from sts_jax.mvae import Gaussian, product_of_experts
 from sts_jax.statespace import harmonics, poses, state, window
 from sts_jax.statespace.config import IMAGES, TINT, Config
@@ -366,6 +367,7 @@ class Model(nnx.Module):
         self.decoder = Decoder(config, rngs)
 
 
+@in_32_bits
 def init(key: PRNGKeyArray, config: Config) -> tuple[nnx.GraphDef[Model], nnx.State, nnx.State]:
     """Create a model with random parameters: its definition, its parameters, and an empty state of batch statistics."""
 

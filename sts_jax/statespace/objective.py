@@ -29,6 +29,7 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from sts_jax._checked import in_32_bits
 from sts_jax.mvae import Gaussian, kl_standard_normal
 from sts_jax.statespace import poses, state, window
 from sts_jax.statespace.config import IMAGES, TINT
@@ -113,6 +114,7 @@ class _Pictures(NamedTuple):
     counts: dict[str, Bool[Array, "n"]]  # False for items without the target
 
 
+@in_32_bits
 def loss(
     graphdef: nnx.GraphDef[Model],
     params: nnx.State,

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Bool, Float, Key
 
+from sts_jax._checked import in_32_bits
 from sts_jax.mvae import Gaussian
 from sts_jax.statespace import poses, state
 from sts_jax.statespace.config import Config
@@ -94,6 +95,7 @@ class Samples(NamedTuple):
     mean: dict[str, Float[Array, "n size size 3"]]  # expected images: means over the `drawn` samples
 
 
+@in_32_bits
 def sample(
     graphdef: nnx.GraphDef[Model],
     params: nnx.State,

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sts_jax import objects
+from sts_jax._checked import in_32_bits
 from sts_jax.statespace import harmonics, poses
 
 DEGREE = 6  # largest degree of the spherical harmonics of a support function
@@ -54,6 +55,7 @@ def join(state: State) -> Float[Array, "n code"]:
     return jnp.concatenate(state, axis=-1)
 
 
+@in_32_bits
 def encode(
     pose: Float[Array, "n 12"],
     support: Float[Array, "n 128"],

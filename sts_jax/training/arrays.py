@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from sts_jax import mvae, optics, physics, statespace
-from sts_jax._checked import checked
+from sts_jax._checked import checked, in_32_bits
 from sts_jax.dataset import Ends, Measurement, Pairs, Views, reduced_images
 from sts_jax.sensor import Sensor
 from sts_jax.training.preprocess import Preprocessing
@@ -108,6 +108,7 @@ def check(model: Config, arrays: Arrays, absent: tuple[str, ...] = ()) -> None:
         raise ValueError(f"`condition` has width {width}, but the model has condition={model.condition}")
 
 
+@in_32_bits
 def frame_arrays(
     pairs: Pairs,
     modalities: tuple[str, ...],
@@ -144,6 +145,7 @@ def frame_arrays(
     return _arrays(frames, modalities, preprocessing, blank, condition if condition.shape[1] else None, further)
 
 
+@in_32_bits
 @checked
 def image_arrays(
     visual: UInt8[np.ndarray, "n 2 h w 3"],
@@ -210,6 +212,7 @@ def paper_model(
     return mvae.Config((*chosen, *further), condition=len(preprocessing.condition_scale))
 
 
+@in_32_bits
 def state_arrays(
     pairs: Pairs,
     model: statespace.Config,
@@ -270,6 +273,7 @@ def _ends(
     }
 
 
+@in_32_bits
 def state_codes(
     preprocessing: Preprocessing, pose: np.ndarray, support: np.ndarray, mass: np.ndarray, com: np.ndarray
 ) -> np.ndarray:
@@ -297,6 +301,7 @@ def _pose_codes(preprocessing: Preprocessing, pose: Float[Array | np.ndarray, "*
     return preprocessing.encode_pose(jnp.asarray(pose))
 
 
+@in_32_bits
 def state_model(
     pairs: Pairs,
     sensor: Sensor,

@@ -15,12 +15,14 @@ resumed training makes them again.
 
 import contextlib
 import dataclasses
+import glob
 import hashlib
 import io
 import json
 import logging
 import os
 import shutil
+import tempfile
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -36,7 +38,7 @@ from jaxtyping import Array, ArrayLike, Int, UInt8
 from orbax.checkpoint import v1 as ocp
 
 from sts_jax import mvae, statespace, storage
-from sts_jax._checked import check_arrays, checked
+from sts_jax._checked import check_arrays, checked, in_32_bits
 from sts_jax.training.arrays import Arrays, Config, check
 
 CONFIG, BLANK, CALIBRATION, LOG = "config.json", "blank.npz", "calibration.json", "metrics.jsonl"
@@ -168,9 +170,9 @@ def save(folder: Path, state: TrainState, *, compact: bool = False) -> None:
                 write_rounded(path / COMPACT, _plain(state))
             else:
                 path.parent.mkdir(parents=True, exist_ok=True)
-                with _quiet_orbax():
+                with _orbax(path) as place:
                     parts = {part: leaves for part, leaves in _parts(state).items() if leaves}
-                    ocp.save_checkpointables(str(path.absolute()), parts)
+                    ocp.save_checkpointables(place, parts)
         except Exception as error:  # Orbax and TensorStore raise many types, with pages of traceback
             raise OSError(
                 f"cannot write {path}: {_first_line(error)}. {storage.remedy(error)}, then start again from step "
@@ -346,6 +348,7 @@ def read_calibration(folder: Path) -> tuple[statespace.Calibration, int | None] 
     return statespace.Calibration(*jnp.asarray(rows, jnp.float32).reshape(-1, 4).T), content.data
 
 
+@in_32_bits
 def load(workdir: str | os.PathLike[str], *, calibrated: bool = True) -> Model:
     """Load a model, after comparing its files with their checksums. A training may run in the folder meanwhile.
 
@@ -389,6 +392,7 @@ def _load(workdir: Path, calibrated: bool) -> Model:
     return Model(config, graphdef, state, step, settings, fitted[0] if fitted else None)
 
 
+@in_32_bits
 def calibrate(workdir: str | os.PathLike[str], arrays: Arrays) -> Model:
     """Fit the calibration of a trained state-space model, and write it to `calibration.json` in the model's
 
@@ -459,15 +463,15 @@ def _read_orbax(path: Path, part: str, wanted: dict[str, Any]) -> dict[str, Arra
     abstract = {name: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device) for name, x in wanted.items()}
     context = ocp.Context()
     context.pytree.loading.partial_load = True
-    with _quiet_orbax():
+    with _orbax(path) as place:
         # Compare the shapes first. Orbax cuts or pads arrays of another shape, or prints thousands of lines.
-        stored = ocp.metadata(str(path.absolute()), part).metadata
+        stored = ocp.metadata(place, part).metadata
         _compare(stored, wanted)
         if part == OPTIMISER and stored.keys() != wanted.keys():
             extra = min(stored.keys() - wanted.keys())
             raise ValueError(f"the checkpoint has the array {extra}, which the given optimiser's state lacks")
         with context:
-            return ocp.load(str(path.absolute()), abstract, checkpointable_name=part)
+            return ocp.load(place, abstract, checkpointable_name=part)
 
 
 def _compare(stored: Mapping[str, Any], wanted: dict[str, Any]) -> None:
@@ -495,14 +499,21 @@ def _keep_only(folder: Path, step: int | None) -> None:
 
 
 @contextlib.contextmanager
-def _quiet_orbax() -> Iterator[None]:
-    """Silence the log in which Orbax prints the tracebacks of its threads, 237 lines if the disk is full."""
+def _orbax(path: Path) -> Iterator[str]:
+    """The path of a checkpoint for Orbax, without the log in which Orbax prints the tracebacks of its threads.
+
+    Orbax takes the path for a pattern, so a path with brackets is reached through a link.
+    """
     logger = logging.getLogger("absl")
     disabled, logger.disabled = logger.disabled, True
-    try:
-        yield
-    finally:
-        logger.disabled = disabled
+    path = path.absolute()
+    with contextlib.ExitStack() as stack:
+        stack.callback(setattr, logger, "disabled", disabled)
+        if glob.escape(str(path)) != str(path):
+            link = Path(stack.enter_context(tempfile.TemporaryDirectory()), "link")
+            link.symlink_to(path.parent)
+            path = link / path.name
+        yield str(path)
 
 
 def _plain(state: TrainState) -> dict[str, Any]:

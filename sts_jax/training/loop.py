@@ -19,6 +19,7 @@ from flax import nnx
 from jaxtyping import Array, PRNGKeyArray
 
 from sts_jax import mvae, statespace, storage
+from sts_jax._checked import in_32_bits
 from sts_jax._ranges import COUNT, NOT_NEGATIVE, NUMBER, POSITIVE, SHARE
 from sts_jax._ranges import check as check_ranges
 from sts_jax.training import folder
@@ -138,6 +139,7 @@ def learner(model: Config, *, targets: Literal["all", "own"] = "all", absent: tu
     return Learner(lambda key: package.init(key, model), loss, functools.partial(check, model, absent=absent))
 
 
+@in_32_bits
 def initial(
     config: TrainConfig, learner: Learner, total: int, optimiser: optax.GradientTransformation | None = None
 ) -> tuple[nnx.GraphDef[Any], TrainState]:
@@ -148,6 +150,7 @@ def initial(
     return graphdef, TrainState(params, stats, jax.jit(optimiser.init)(params), jnp.zeros((), jnp.int32))
 
 
+@in_32_bits
 def step(
     learner: Learner,
     graphdef: nnx.GraphDef[Any],
@@ -184,6 +187,7 @@ def step(
     return TrainState(optax.apply_updates(state.params, update), stats, rest, state.step + 1), terms
 
 
+@in_32_bits
 def train(
     config: TrainConfig,
     model: Config,

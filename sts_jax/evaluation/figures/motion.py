@@ -16,6 +16,7 @@ from matplotlib.lines import Line2D
 from matplotlib.text import Annotation, Text
 
 from sts_jax import geometry, optics
+from sts_jax._checked import in_32_bits
 from sts_jax.evaluation.figures import pictures
 from sts_jax.objects import Body
 from sts_jax.storage import write_bytes
@@ -32,6 +33,7 @@ _PAD = np.array([178, 178, 204], np.float32) / 255  # sRGB
 _HOUSING = np.array([0.05, 0.05, 0.055], np.float32)
 
 
+@in_32_bits
 @functools.partial(jax.jit, static_argnames=("resolution",))
 def outside(
     body: Body,
