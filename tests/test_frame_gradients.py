@@ -50,7 +50,7 @@ BOX = from_trimesh(trimesh.creation.box((0.05, 0.04, 0.02)).subdivide().subdivid
 
 def seen(sensor, body, pose, wrench, crop):
     """All values of a frame that can have a derivative."""
-    frame = sts.sense(sensor, body, pose, wrench, resolution=SHAPE, crop=crop)
+    frame = sts.sense.__wrapped__(sensor, body, pose, wrench, resolution=SHAPE, crop=crop)  # also in 64 bits
     x, y = tactile.cell_centres(sensor.gel)
     force = frame.pressure * tactile.cell_area(sensor.gel)
     return {

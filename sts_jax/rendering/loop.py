@@ -19,6 +19,7 @@ from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, ArrayLike
 
 from sts_jax._checked import settings
+from sts_jax._devices import on_each_device
 
 Flat = Callable[..., list[Array]]
 
@@ -101,14 +102,20 @@ def _over_batch(
     `single` and `dense` compute the same function. `single` is called in a loop on a CPU, and `dense` under `jax.vmap`
     on other devices.
     """
-    if jax.default_backend() != "cpu" or not any(flags):
-        return jax.vmap(dense, in_axes=[0 if flag else None for flag in flags], axis_size=size)(*leaves)
+    if not any(flags):
+        return jax.vmap(dense, in_axes=None, axis_size=size)(*leaves)
 
-    def one(mapped: list[Array]) -> list[Array]:
-        items = iter(mapped)
-        return single(*(next(items) if flag else leaf for leaf, flag in zip(leaves, flags, strict=True)))
+    def merged(items: list[Array], shared: list[Array]) -> list[Array]:
+        mapped, whole = iter(items), iter(shared)
+        return [next(mapped if flag else whole) for flag in flags]
 
-    return jax.lax.map(one, [leaf for leaf, flag in zip(leaves, flags, strict=True) if flag])
+    def of_device(items: list[Array], shared: list[Array]) -> list[Array]:
+        if jax.default_backend() == "cpu":
+            return jax.lax.map(lambda item: single(*merged(item, shared)), items)
+        return jax.vmap(lambda item: dense(*merged(item, shared)))(items)
+
+    items, shared = ([x for x, flag in zip(leaves, flags, strict=True) if flag == kind] for kind in (True, False))
+    return on_each_device(of_device, items, shared)
 
 
 # Primitive that applies the derivative of a function. Its operands are the function's arguments, followed by tangents

@@ -210,9 +210,10 @@ def read(folder: Path, step: int, like: TrainState) -> TrainState:
             if (path / COMPACT).exists():
                 stored = read_rounded(path / COMPACT)
                 _compare(stored, wanted)
-                loaded |= jax.device_put({name: stored[name] for name in wanted}, jax.devices()[0])
+                loaded |= jax.device_put({name: stored[name] for name in wanted})
             else:
-                loaded |= _read_orbax(path, part, wanted)
+                # Not bound to a device, so that they can be used with several
+                loaded |= jax.device_put(jax.tree.map(np.asarray, _read_orbax(path, part, wanted)))
         except Exception as error:  # Orbax, TensorStore and zipfile raise many types, some with pages of traceback
             problem, remedy = "cannot be read", "It belongs to another model or version of sts_jax: train again"
             if part == OPTIMISER:
@@ -339,7 +340,7 @@ def read_calibration(folder: Path) -> tuple[statespace.Calibration, int | None] 
             warnings.warn(
                 f"{folder / CALIBRATION} is not used, because {storage.MANIFEST} does not list it: it is that of "
                 "another model or checkpoint. Calibrate again (training.calibrate)",
-                stacklevel=2,
+                stacklevel=3,
             )
         return None
     storage.verify(folder, listed, remedy, [CALIBRATION])

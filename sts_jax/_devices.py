@@ -1,0 +1,40 @@
+"""Computation of the items of a batch on the devices of a mesh with explicit axes."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+from jax.sharding import AxisType, NamedSharding, PartitionSpec
+
+
+def on_each_device(function: Callable[[Any, Any], Any], items: Any, shared: Any, axes: Any = 0) -> Any:
+    """Call `function(items, shared)` on every device that has a part of the items, with this part.
+
+    JAX splits no operation over an explicit axis by itself if its result could be split in several ways. Without
+    explicit axes, this is one call of the function.
+
+    Args:
+        items: Tree of arrays whose first axis may be split over devices.
+        shared: Tree of arrays that every device needs as a whole.
+        axes: Axis of the items in the results, as a prefix of the tree of results.
+    """
+    split = [x for x in jax.tree.leaves(items) if _is_split(x)]
+    if not split:
+        return function(items, shared)
+    names = next((spec[0] for x in split if (spec := jax.typeof(x).sharding.spec) and spec[0] is not None), None)
+    mesh = (jax.typeof(split[0]) if isinstance(split[0], jax.core.Tracer) else split[0]).sharding.mesh
+    here, whole = PartitionSpec(names), PartitionSpec()
+    items, shared = (
+        jax.tree.map(lambda x, spec=spec: jax.sharding.reshard(x, NamedSharding(mesh, spec)), tree)
+        for tree, spec in ((items, here), (shared, whole))
+    )
+    if names is None:
+        return function(items, shared)
+    results = jax.tree.map(lambda axis: PartitionSpec(*[None] * axis, names), axes)
+    call = jax.shard_map(function, mesh=mesh, in_specs=(here, whole), out_specs=results, check_vma=False)
+    return call(items, shared)
+
+
+def _is_split(x: Any) -> bool:
+    kind = jax.typeof(x).sharding
+    return AxisType.Explicit in kind.mesh.axis_types and any(name is not None for name in kind.spec)
