@@ -110,12 +110,12 @@ def test_derivatives_and_loops_keep_the_32_bits_of_their_function():
     from sts_jax.rendering.loop import looped
 
     @looped
-    def inner(x, n):
-        return jax.lax.fori_loop(0, n, lambda _, y: jnp.sin(y) * jnp.ones(3), x).sum()
+    def inner(x):
+        return jax.lax.fori_loop(0, 3, lambda _, y: jnp.sin(y) * jnp.ones(3), x).sum()
 
     @in_32_bits
     def outer(x):
-        return jax.jit(inner)(jnp.asarray(x, float), 3)
+        return jax.jit(inner)(jnp.asarray(x, float))
 
     x = np.linspace(0.1, 1, 6).reshape(2, 3)
     slope = np.prod([np.cos(x), np.cos(np.sin(x)), np.cos(np.sin(np.sin(x)))], axis=0)
@@ -123,7 +123,7 @@ def test_derivatives_and_loops_keep_the_32_bits_of_their_function():
         given = jnp.asarray(x)
         for derivative in (jax.grad(outer), jax.jacfwd(outer), jax.jit(jax.grad(outer)), jax.jacrev(outer)):
             np.testing.assert_allclose(jax.vmap(derivative)(given), slope, rtol=1e-5)
-        assert jax.vmap(outer)(given).dtype == jnp.float32
+        assert jax.vmap(jax.jit(outer))(given).dtype == jnp.float32
 
 
 MESH = """

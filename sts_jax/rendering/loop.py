@@ -45,9 +45,14 @@ def looped(function: Callable[..., Any]) -> Callable[..., Any]:
     return with_trees
 
 
-def _looped(function: Flat) -> Flat:
+def _looped(given: Flat) -> Flat:
     """`looped` for a function from arrays to a list of arrays."""
-    x64 = jax.config.jax_enable_x64  # of the first trace. JAX traces derivatives later, with the caller's settings
+    # JAX traces the function again for batches and derivatives, then with the caller's settings.
+    x64 = jax.config.jax_enable_x64
+
+    def function(*leaves: Array) -> list[Array]:
+        with settings(x64):
+            return given(*leaves)
 
     # JAX passes flags and symbolic zeros in place of arrays. They would have the wrong type for the fields of the
     # caller's trees, so all functions below use lists of arrays.
