@@ -18,23 +18,22 @@ def on_each_device(function: Callable[[Any, Any], Any], items: Any, shared: Any,
         shared: Tree of arrays that every device needs as a whole.
         axes: Axis of the items in the results, as a prefix of the tree of results.
     """
-    split = [x for x in jax.tree.leaves(items) if _is_split(x)]
-    if not split:
+    first = next((x for x in jax.tree.leaves(items) if _names(x) is not None), None)
+    if first is None:
         return function(items, shared)
-    names = next((spec[0] for x in split if (spec := jax.typeof(x).sharding.spec) and spec[0] is not None), None)
-    mesh = (jax.typeof(split[0]) if isinstance(split[0], jax.core.Tracer) else split[0]).sharding.mesh
+    names = _names(first)
+    mesh = (jax.typeof(first) if isinstance(first, jax.core.Tracer) else first).sharding.mesh
     here, whole = PartitionSpec(names), PartitionSpec()
     items, shared = (
         jax.tree.map(lambda x, spec=spec: jax.sharding.reshard(x, NamedSharding(mesh, spec)), tree)
         for tree, spec in ((items, here), (shared, whole))
     )
-    if names is None:
-        return function(items, shared)
     results = jax.tree.map(lambda axis: PartitionSpec(*[None] * axis, names), axes)
     call = jax.shard_map(function, mesh=mesh, in_specs=(here, whole), out_specs=results, check_vma=False)
     return call(items, shared)
 
 
-def _is_split(x: Any) -> bool:
-    kind = jax.typeof(x).sharding
-    return AxisType.Explicit in kind.mesh.axis_types and any(name is not None for name in kind.spec)
+def _names(x: Any) -> Any:
+    """Explicit axes of the mesh over which the first axis of an array is split, or None."""
+    sharding = jax.typeof(x).sharding
+    return sharding.spec[0] if AxisType.Explicit in sharding.mesh.axis_types and sharding.spec else None
