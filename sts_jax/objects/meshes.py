@@ -109,8 +109,8 @@ def load(
         density: Mass of the shell per area (kg/m^2), if `mass` is None.
         hollow: If True and `mass` is None, the body can hold contents of 1,000 kg/m^3. The filled share is an argument
             of `rigid`. The convex hull bounds the contents of a mesh that is not closed, with a warning.
-        strict: If True, a mesh that is not closed or encloses no volume is an error, and so is a missing material or
-            image of an OBJ file.
+        strict: If True, a mesh that is not closed or encloses no volume is an error, and so are missing images and
+            materials, and parts of the file that are not supported.
         up: Axis of the file, or direction in the file, that becomes +z. The convention of glTF files is "y".
         front: Direction in the file that becomes -y, by default (0, -1, 0). Must be None if `up` is an axis.
         texture: Image file that replaces the file's own textures. It needs texture coordinates in the mesh.
