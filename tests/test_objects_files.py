@@ -265,6 +265,7 @@ def test_relative_indices_comments_and_lines_of_other_kinds(tmp_path):
         (("f 1/1 2/2 3/3", "f 1/1 2/2"), "fewer than three corners"),
         (("vt 0.1", "vt nan"), "texture coordinates that are NaN"),
         (("vt 0.1", "vt 1e30"), "texture coordinates that are NaN or beyond"),
+        (("f 1/1 2/2", "f " + "1/1 9/9 5/5 " * 1000 + "2/2"), "a concave face has 3,002 corners"),
     ],
 )
 def test_faults_of_an_obj_are_named(tmp_path, change, message):

@@ -35,6 +35,7 @@ UNSUPPORTED = (
 # Options of `map_Kd`, and how many values follow them at most. Options -s and -o are applied.
 _OPTIONS = {b"-s": 3, b"-o": 3, b"-t": 3, b"-mm": 2}
 _OPTIONS |= dict.fromkeys(b"-blendu -blendv -bm -boost -cc -clamp -imfchan -texres -type".split(), 1)
+_WIDE = (b"\xff\xfe", b"\xfe\xff")  # byte-order marks of UTF-16
 _TEXTURE = rb"(?im)^comment\s+texturefile\s+(.+?)\s*$"  # in the header of a PLY
 
 
@@ -97,7 +98,7 @@ def _loaded(content: Path | bytes, kind: str | None, resolver: Any) -> list[trim
 
 def _text(data: bytes, name: str = "the file") -> bytes:
     """Return a text without its byte-order mark, or raise an error if it is UTF-16."""
-    if b"\0" in data[:1024] or data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+    if b"\0" in data[:1024] or data[:2] in _WIDE:
         raise Refusal(f"{name} is no text of 8-bit characters: save it as UTF-8 if it is UTF-16")
     return data.removeprefix(b"\xef\xbb\xbf")
 
@@ -143,8 +144,8 @@ def _materials(path: Path, files: Files) -> dict[bytes, Look]:
             name = rest.strip()
             looks[name] = Look()
         elif word == b"kd" and name is not None and rest.split()[:1] not in ([b"spectral"], [b"xyz"]):
-            color = np.array(rest.split()[:3], float)
-            looks[name] = looks[name]._replace(color=_unit(color if color.size > 1 else np.repeat(color, 3), 3, path))
+            color = np.array(rest.split()[:3] * (3 if len(rest.split()) == 1 else 1), float)
+            looks[name] = looks[name]._replace(color=_unit(color, 3, f"{path}: "))
         elif word == b"map_kd" and name is not None:
             looks[name], ignored = _mapped(looks[name], rest.strip())
             if ignored:
@@ -152,10 +153,10 @@ def _materials(path: Path, files: Files) -> dict[bytes, Look]:
     return looks
 
 
-def _unit(color: np.ndarray, size: int, path: Path) -> np.ndarray:
+def _unit(color: np.ndarray, size: int, place: str = "") -> np.ndarray:
     """Return a colour unless its values are not in [0, 1], except for rounding."""
     if color.shape != (size,) or not ((color >= 0) & (color <= 1.01)).all():
-        raise Refusal(f"{path}: the colour of a material must be {size} numbers in [0, 1], got {color.tolist()}")
+        raise Refusal(f"{place}the colour of a material must be {size} numbers in [0, 1], got {color.tolist()}")
     return color
 
 
@@ -281,6 +282,8 @@ def _numbers(rows: list[list[bytes]], least: int, what: str) -> np.ndarray:
 
 def _stl(data: bytes, _: Files) -> list[trimesh.Trimesh]:
     """Read an STL: text (solid ... endsolid), or a header of 80 bytes, a number and triangles of 50 bytes each."""
+    if data[:2] in _WIDE:
+        _text(data)  # raises an error
     number = int.from_bytes(data[80:84], "little")
     text = data.removeprefix(b"\xef\xbb\xbf").lstrip().lower()
     if 84 + 50 * number != len(data) and text.startswith(b"solid") and b"\0" not in text[:1024]:
@@ -368,7 +371,7 @@ def _gltf(data: bytes, files: Files) -> list[trimesh.Trimesh]:
             raise FileNotFoundError(f"{files.path}: the mesh refers to the missing file {part['uri']}: add it")
         part["uri"], buffers[f"{number}"] = f"{number}", content
     _check(header, files)
-    looks = [_look(material, files.path) for material in header.get("materials", [])]
+    looks = [_look(material) for material in header.get("materials", [])]
     images = {} if files.plain else _images(header, files, buffers, looks)
     for number, (color, _) in enumerate(looks):
         header["materials"][number] = {"name": f"{number}", "pbrMetallicRoughness": {"baseColorFactor": color.tolist()}}
@@ -432,12 +435,12 @@ def _check(header: dict[str, Any], files: Files) -> None:
                     raise Refusal(f"{name} has whole numbers (KHR_mesh_quantization), not supported: export floats")
 
 
-def _look(material: dict[str, Any], path: Path) -> tuple[np.ndarray, dict[str, Any]]:
+def _look(material: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any]]:
     """Return the colour factor (4,) of a glTF material and the reference to its texture, {} without one."""
     surface = material.get("pbrMetallicRoughness", {})
     gloss = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
     color = np.array(surface.get("baseColorFactor", gloss.get("diffuseFactor", [1.0] * 4)), float)
-    return _unit(color, 4, path), surface.get("baseColorTexture", gloss.get("diffuseTexture", {}))
+    return _unit(color, 4), surface.get("baseColorTexture", gloss.get("diffuseTexture", {}))
 
 
 def _transform(info: dict[str, Any]) -> tuple[int, np.ndarray, float, np.ndarray]:

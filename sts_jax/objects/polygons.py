@@ -16,6 +16,7 @@ _CODES = {
     **{"int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "int64": "q"},
     **{"uint64": "Q", "float16": "e", "float32": "f", "float64": "d"},
 }
+LONGEST = 2000  # corners of a concave polygon, whose cutting takes a time of the second order
 
 
 def cut(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "_ 3"]:
@@ -37,7 +38,9 @@ def cut(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "_ 3"]:
     area, grain = np.linalg.norm(normal), 1e-12 * np.ptp(corners, axis=0).max() ** 2
     if (np.cross(corners[1:-1], corners[2:]) @ normal >= -grain * area).all() and area > grain:
         return ring[fan[:, ::-1] if backwards else fan]  # convex
-    x, y = np.linalg.svd(normal[None])[2][1:] if area > grain else np.linalg.svd(corners)[2][:2]
+    if num > LONGEST:
+        raise Refusal(f"a concave face has {num:,} corners, but at most {LONGEST:,} are cut: split it into triangles")
+    x, y = np.linalg.svd(normal[None])[2][1:] if area > grain else np.linalg.svd(corners, full_matrices=False)[2][:2]
     plane = corners @ np.stack([x, y if np.cross(x, y) @ normal >= 0 else -y], axis=1)
     triangles = _ears(plane, grain)
     if np.abs(_areas(plane, triangles)).sum() > (1 + 1e-3) * area + 1e6 * grain:
