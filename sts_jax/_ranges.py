@@ -17,6 +17,7 @@ COUNT = {"at_least": 1, "at_most": 10**9, "whole": True}
 MOST_PIXELS = 8192  # height or width of an image
 STATIC = {"static": True}  # JAX compiles a program for each value of the field
 
+_LARGEST = 2**32  # whole numbers must be smaller, because JAX has 32 bits for a seed
 _SMALLEST = float(np.finfo(np.float32).tiny)  # float32 arithmetic flushes smaller numbers to 0
 
 
@@ -48,6 +49,9 @@ def check(config: Any, owner: str = "") -> None:
             raise ValueError(f"{owner}{field.name} must be a whole number, got {value!r}")
         if not -np.inf < value < np.inf:
             raise ValueError(f"{owner}{field.name} must be finite, got {value!r}")
-        for holds, words in limits(metadata, np.asarray(value)):
+        number = value
+        if metadata.get("whole"):
+            number, metadata = min(max(value, -_LARGEST), _LARGEST), {"at_most": _LARGEST - 1, **metadata}
+        for holds, words in limits(metadata, np.asarray(number)):
             if not holds:
                 raise ValueError(f"{owner}{field.name} {words.removeprefix('it ')}, got {value!r}")

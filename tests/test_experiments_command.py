@@ -176,6 +176,25 @@ def test_a_wrong_field_is_an_error_before_anything_is_written(fields, message, t
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize("number", ["99999999999999999999", "1" + "0" * 400, "-99999999999999999999", "1e999", "nan"])
+@pytest.mark.parametrize(
+    "option",
+    [
+        *("training.warmup", "state-training.beta-warmup", "collection.seed", "collection.num-per-object"),
+        *("num-samples", "image-size", "collection.scenario.rate", "collection.scenario.frames"),
+    ],
+)
+def test_an_absurd_number_is_one_line(option, number, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(run, "main", lambda *_, **__: pytest.fail("the number is accepted"))
+    monkeypatch.setattr("sys.argv", ["freefall", "--preset", "smoke", f"--{option}", number])
+    with pytest.raises(SystemExit) as stopped:
+        run.command(freefall.PRESETS, str(tmp_path), None)
+    printed = "".join(capsys.readouterr())
+    name = option.rpartition(".")[2]
+    assert name.replace("-", "_") in f"{stopped.value}{printed}" or name in printed
+    assert "\n" not in str(stopped.value)
+
+
 @pytest.mark.parametrize("count", [3, 6, 12, 25])
 def test_a_split_with_an_empty_part_is_refused(count):
     few = changed(freefall.DEFAULT, {"num_objects": count, "num_full": 0})

@@ -29,6 +29,7 @@ TITLES = {
     "vae-visual": "VAE visual only",
     "vae-tactile": "VAE tactile only",
 }
+MOST = 1_000_000  # largest number of anything in the evaluation
 SMALLEST = 16  # side of the smallest images in which the outline of an object can be judged (pixels)
 SPLITS = ("object", "trajectory")
 
@@ -250,6 +251,10 @@ def check(config: Config, own: Extensions = NONE) -> None:
     for name in ("num_shown", "num_samples", "rerolls", "num_rerolled"):
         if getattr(config, name) < 1:
             raise ValueError(f"{name} must be >= 1, got {getattr(config, name)}")
+        if getattr(config, name) > MOST:
+            raise ValueError(f"{name} must be <= {MOST}, got {getattr(config, name)}")
+    for number in config.steps or ():
+        dataclasses.replace(config.training, steps=number)  # raises an error for a number out of range
     if not config.splits or not set(config.splits) <= set(SPLITS):
         raise ValueError(f"splits must be one or more of {', '.join(SPLITS)}, got {config.splits}")
     for split in config.splits:

@@ -53,8 +53,8 @@ class Args:
 
 def command(presets: Mapping[str, Config], workdir: str, description: str | None) -> None:
     """Run an experiment from the command line, with the presets by name and the default of `--workdir`."""
-    args = parse(presets, workdir, description)
-    with on_one_line(debug=args.debug):
+    with on_one_line(debug="debug" in options(sys.argv[1:])):
+        args = parse(presets, workdir, description)
         sts.enable_compilation_cache()
         main(configure(args), args.workdir, only=args.only)
 

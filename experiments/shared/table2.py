@@ -10,7 +10,7 @@ import tyro
 
 import sts_jax as sts
 from experiments.shared.collecting import Collect, collect
-from experiments.shared.config import MODELS, TITLES
+from experiments.shared.config import MODELS, MOST, TITLES
 from experiments.shared.evaluate import identity, record, stale
 from experiments.shared.run import Job, Stage, train_model
 from experiments.shared.terminal import Bar, say
@@ -98,8 +98,11 @@ def check(config: Config) -> None:
     if not 0 < config.held_out < 1:
         raise ValueError(f"held_out must be a share above 0 and below 1, got {config.held_out}")
     for name, least in (("count", LEAST), ("num_shown", 1), ("shifts", 0)):
-        if getattr(config, name) < least:
-            raise ValueError(f"{name} must be >= {least}, got {getattr(config, name)}")
+        if not least <= getattr(config, name) <= MOST:
+            raise ValueError(f"{name} must be >= {least} and <= {MOST}, got {getattr(config, name)}")
+    for number in config.steps or ():
+        dataclasses.replace(config.training, steps=number)  # raises an error for a number out of range
+    dataclasses.replace(config.training, seed=config.seed)
     if not 0 <= config.largest_shift < config.image_size:
         raise ValueError(f"largest_shift must be 0 to {config.image_size - 1} pixels, got {config.largest_shift}")
     # This raises an error if no network exists for images of this size.

@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Iterator
 from typing import Any
 
+import jax
 from tqdm import tqdm
 
 from experiments.shared import interrupts
@@ -78,6 +79,11 @@ def on_one_line(*, debug: bool = False) -> Iterator[None]:
     except KeyboardInterrupt:
         say(interrupts.LINE)
         raise SystemExit(interrupts.CODE) from None
+    except (MemoryError, OverflowError, jax.errors.JaxRuntimeError) as error:
+        if debug or (isinstance(error, jax.errors.JaxRuntimeError) and "RESOURCE_EXHAUSTED" not in str(error)):
+            raise
+        reason = str(error).partition("\n")[0] or "out of memory"
+        raise SystemExit(f"error: an option has too large a number for this computer: {reason}") from None
     finally:
         warnings.formatwarning = usual
 

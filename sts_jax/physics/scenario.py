@@ -268,8 +268,8 @@ def check_length(name: str, value: float) -> None:
 
 def _check_times(scenario: Scenario) -> None:
     rate, timestep = scenario.rate, scenario.contact.timestep
-    if not rate > 0:
-        raise ValueError(f"scenario.rate is {rate}/s, but it must be > 0")
+    if not 1e-9 < rate < 1e9:
+        raise ValueError(f"scenario.rate is {rate}/s, but it must be > 0 and finite")
     steps = 1 / (rate * timestep)
     if not (steps >= 1 and abs(steps - round(steps)) < 1e-6):
         raise ValueError(
