@@ -7,6 +7,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from sts_jax.objects.body import HULL_CLASSES, Body
 
+FLAT = 0.02  # share of the surface of a hull, least area of a flat face whose corners are kept
 HULL_TOLERANCE = 5e-5  # m, a hull is not refined further if no point is farther outside than this
 SAME_FACE = np.deg2rad(0.5)  # rad, triangles of a hull whose normals differ by less than this form one face
 REST_GRAIN = 2e-5  # m, points of a hull nearer to a face's plane than this are part of the face
@@ -31,27 +32,52 @@ def convex_hull(
     """Vertices of an approximate convex hull of points.
 
     The hull starts as a tetrahedron of four points. Then the point farthest outside the hull is added
-    repeatedly, until no point is more than `tolerance` (m) outside, or until the hull has `limit` vertices.
+    repeatedly, until no point is more than `tolerance` (m) outside, or until the hull has `limit` vertices. If these
+    are too few, as for a die with round edges, the hull starts with corners of the large flat faces, on which the
+    object rests.
     """
     try:
         candidates = points[ConvexHull(points).vertices]
     except (QhullError, ValueError) as error:
         raise ValueError("the points lie in a plane, so their convex hull has no volume: thicken the object") from error
+    chosen, remains = _refined(candidates, [], limit, tolerance)
+    if remains > tolerance > 0:
+        chosen, _ = _refined(candidates, _flat_corners(candidates, max(limit // 2, 24)), limit, tolerance)
+    corners = candidates[chosen]
+    return corners[np.sort(ConvexHull(corners).vertices)]
+
+
+def _refined(candidates: np.ndarray, seeds: list[int], limit: int, tolerance: float) -> tuple[list[int], float]:
+    """Indices of the vertices of `convex_hull`, and the largest distance (m) of a candidate outside."""
     chosen = [int(np.argmax(candidates[:, 0]))]
     relative = candidates - candidates[chosen[0]]
     chosen.append(int(np.argmax(np.linalg.norm(relative, axis=1))))
     chosen.append(int(np.argmax(np.linalg.norm(np.cross(relative, relative[chosen[1]]), axis=1))))
     normal = np.cross(relative[chosen[1]], relative[chosen[2]])
     chosen.append(int(np.argmax(np.abs(relative @ normal))))
-    while len(chosen) < limit:
+    chosen += [seed for seed in seeds if seed not in chosen]
+    while True:
         planes = ConvexHull(candidates[chosen]).equations
         outside = (candidates @ planes[:, :3].T + planes[:, 3]).max(axis=1)
         furthest = int(np.argmax(outside))
-        if outside[furthest] <= tolerance:
-            break
+        if len(chosen) >= limit or outside[furthest] <= tolerance:
+            return chosen, float(outside[furthest])
         chosen.append(furthest)
-    corners = candidates[chosen]
-    return corners[np.sort(ConvexHull(corners).vertices)]
+
+
+def _flat_corners(candidates: np.ndarray, most: int) -> list[int]:
+    """Indices of at most `most` corners of those flat faces of a hull that have at least FLAT of its surface."""
+    hull, found = ConvexHull(candidates), []
+    planes, plane = np.unique(hull.equations.round(6), axis=0, return_inverse=True)
+    area = np.bincount(plane, weights=trimesh.triangles.area(candidates[hull.simplices]))
+    faces = np.flatnonzero(area >= FLAT * hull.area)
+    each = max(3, most // max(len(faces), 1))
+    for face in faces[np.argsort(-area[faces])][: most // 3]:
+        corners = np.unique(hull.simplices[plane == face])
+        across = np.linalg.svd(planes[face, None, :3])[2][1:]
+        outline = corners[ConvexHull(candidates[corners] @ across.T).vertices]
+        found += outline[np.linspace(0, len(outline), min(each, len(outline)), endpoint=False).astype(int)].tolist()
+    return found
 
 
 def outside_hull(points: Float[np.ndarray, "n 3"], hull: Float[np.ndarray, "h 3"]) -> Float[np.ndarray, "n"]:
