@@ -216,6 +216,40 @@ def test_damage_is_named_and_nothing_is_overwritten(copied, damage, message):
     assert bytes_of(copied) == before
 
 
+def arrays(name, **changes):
+    def change(at):
+        with np.load(at / f"{name}.npz") as file:
+            kept = dict(file)
+        np.savez(at / f"{name}.npz", **(kept | {key: change(kept[key]) for key, change in changes.items()}))
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (edit("split.json", "test", "all"), r"split\.json .*test"),
+        (edit("split.json", "test", [0, 1, 2, 3]), r"split\.json has an object in two parts"),
+        (edit("split.json", "test", [99]), r"split\.json has an object in two parts, or one >= "),
+        (rewrite("split.json", lambda _: b"{}"), r"split\.json .*train is missing"),
+        (edit("collection.json", "resolution", 32), r"collection\.json .*resolution"),
+        (edit("collection.json", "num_objects", None), r"collection\.json .*num_objects is None"),
+        (arrays(SHARDS[0], **{"trajectory/pose": lambda x: x * np.nan}), r"npz .*trajectory/pose has values"),
+        (arrays(SHARDS[0], **{"trajectory/pose": lambda x: x[:, 1:]}), r"npz .*array trajectory/"),
+        (arrays(SHARDS[0], **{"hidden/fill": lambda x: x > 0}), r"npz .*hidden/fill is bool"),
+        (arrays(SHARDS[1], **{"solid/com": lambda x: x[:, :2]}), r"npz .*solid/com is"),
+        (arrays(SHARDS[1], frames=lambda x: x + 1000), r"npz .*array frames has values"),
+        (arrays(SHARDS[1], **{"trajectory/body": lambda x: x - 100}), r"npz .*array trajectory/body has values"),
+    ],
+)
+def test_absurd_content_with_a_valid_checksum_is_named(copied, damage, message):
+    damage(copied)
+    listed = storage.read_manifest(copied, "")
+    storage.write_manifest(copied, storage.checksums(copied, listed.files), listed.facts)
+    with pytest.raises(storage.DamagedFileError, match=message):
+        dataset.load(copied)
+
+
 def test_an_edited_description_is_named_and_deleted_files_are_made_again_with_the_same_bytes(folder, sparse, copied):
     for name in ("sensor.json", "collection.json"):
         edit(name, "resolution", [32, 64])(copied)

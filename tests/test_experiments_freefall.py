@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 
 import jax
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 import sts_jax as sts
 from experiments import freefall
 from experiments.shared import config, run
-from sts_jax import dataset, evaluation, physics
+from sts_jax import dataset, evaluation, physics, storage
 
 pytestmark = pytest.mark.slow
 
@@ -82,6 +83,20 @@ def test_stale_results_are_computed_again(workdir, capsys):
     log.write_bytes(old)
     run.main(TINY, workdir)
     assert metrics.read_text() == before[0]
+
+
+def test_a_model_is_never_scored_on_its_training_data(workdir, tmp_path):
+    copy = shutil.copytree(workdir, tmp_path / "copy")
+    path = copy / "dataset/split.json"
+    split = json.loads(path.read_text())
+    split["train"][0], split["test"][0] = split["test"][0], split["train"][0]
+    path.write_text(json.dumps(split))
+    with pytest.raises(storage.DamagedFileError, match=r"split\.json is not the file"):
+        run.main(TINY, copy, only="evaluate")
+    listed = storage.read_manifest(copy / "dataset", "")
+    storage.write_manifest(copy / "dataset", storage.checksums(copy / "dataset", listed.files), listed.facts)
+    with pytest.raises(ValueError, match=r"models/mvae was trained with another split .*restore its split\.json"):
+        run.main(TINY, copy, only="evaluate")
 
 
 def test_another_configuration_is_refused(workdir):

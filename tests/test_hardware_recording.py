@@ -1,7 +1,9 @@
 """`Recorder` and `Replay`: what is played back is what was recorded."""
 
+import contextlib
 import dataclasses
 import itertools
+import json
 import math
 import shutil
 import time
@@ -166,11 +168,32 @@ def test_flipped_bits_and_truncated_missing_and_exchanged_files_are_found(folder
     assert len(played(folder)) == 12
 
 
-def test_a_damaged_line_of_an_interrupted_recording_is_named(interrupted):
-    text = (interrupted / "frames.jsonl").read_text()
-    (interrupted / "frames.jsonl").write_text(text.replace('"sequence": 9,', '"sequenc'))
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [('"sequence": 9,', '"sequenc'), ('"sequence": 9,', '"sequence": 8,'), ('"stream": "tactile"', '"stream": "a"')],
+)
+def test_a_damaged_line_of_an_interrupted_recording_is_named(interrupted, old, new):
+    lines = (interrupted / "frames.jsonl").read_text().splitlines(keepends=True)
+    assert old in lines[3]
+    lines[3] = lines[3].replace(old, new)
+    (interrupted / "frames.jsonl").write_text("".join(lines))
     with pytest.raises(DamagedFileError, match=r"frames.jsonl, line 4, is damaged"):
         played(interrupted)
+
+
+def test_a_line_without_checksums_is_read(interrupted):
+    lines = [json.loads(line) for line in (interrupted / "frames.jsonl").read_text().splitlines()]
+    older = [{name: x for name, x in line.items() if name not in ("checksum", "pixels")} for line in lines]
+    (interrupted / "frames.jsonl").write_text("".join(json.dumps(line) + "\n" for line in older))
+    assert len(played(interrupted)) == 12
+
+
+def test_flipped_bits_in_the_images_of_an_interrupted_recording_are_found(interrupted):
+    truth = [one.image for one in played(interrupted)]
+    for kind in damaged(interrupted / "visual.mkv", flips=10):
+        with contextlib.suppress(OSError, ValueError):
+            assert kind in ("flipped", "truncated", "missing")
+            assert all(map(np.array_equal, truth, [one.image for one in played(interrupted)])) or kind != "flipped"
 
 
 @pytest.mark.parametrize(

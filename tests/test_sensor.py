@@ -1,5 +1,6 @@
 """The file of a sensor, and the checks of its constants."""
 
+import contextlib
 import copy
 import dataclasses
 import functools
@@ -9,9 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from damage import damaged
 from optics_bodies import with_field
 
-from sts_jax import Sensor, tactile
+from sts_jax import Sensor, storage, tactile
 
 
 def test_the_defaults_equal_the_papers_values():
@@ -125,3 +127,25 @@ def test_a_damaged_or_missing_file_and_an_unusable_path_are_named(tmp_path):
         Sensor.load(path)
     with pytest.raises(OSError, match=r"cannot write .*sensor\.json/below"):
         Sensor().save(path / "below")
+
+
+def test_flipped_bits_of_a_saved_sensor_are_found_and_edited_files_are_accepted_on_request(tmp_path):
+    path = tmp_path / "sensor.json"
+    Sensor().save(path)
+    for _ in damaged(path):
+        with contextlib.suppress(OSError, ValueError):
+            assert Sensor.load(path).constants() == Sensor().constants()  # a flip in white space
+    values = json.loads(path.read_text())
+    values["gel"]["stiffness"] = 5e5
+    path.write_text(json.dumps(values))
+    with pytest.raises(OSError, match=r"sensor\.json is damaged or was edited .*delete the field `checksum` to accept"):
+        Sensor.load(path)
+    del values["checksum"]
+    path.write_text(json.dumps(values))
+    assert float(Sensor.load(path).gel.stiffness) == 5e5
+    storage.write_manifest(tmp_path, storage.checksums(tmp_path, ["sensor.json"]))
+    path.write_text(json.dumps(values) + " ")
+    with pytest.raises(OSError, match=r"sensor\.json is not the file that manifest\.json lists"):
+        Sensor.load(path)
+    (tmp_path / "manifest.json").write_text("of another program")
+    Sensor.load(path)

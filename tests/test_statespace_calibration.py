@@ -143,7 +143,34 @@ def test_a_kill_while_a_calibration_is_written_leaves_a_valid_model(folder, monk
     with pytest.raises(KeyboardInterrupt):
         training.save_calibration(folder, NUMBERS, STATE.inputs)
     assert writes == ["manifest.json", "calibration.json", "manifest.json"][: moment + 1]
-    assert training.load(folder).calibration is None
+    with pytest.warns(UserWarning, match=r"calibration\.json is not used"):
+        assert training.load(folder).calibration is None
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ([], "content is"),
+        ({"data": 1}, "subsets is missing"),
+        ({"data": "a", "subsets": {}}, "data is 'a'"),
+        ({"data": 1, "subsets": {"a": {"outcome": 1, "weight": 1, "variance": 1}}}, r"subsets\.a\.contrast is missing"),
+        ({"data": 1, "subsets": {"a": dict.fromkeys(NUMBERS._fields, -1)}}, r"outcome is -1"),
+        ({"data": 1, "subsets": {"a": dict.fromkeys(NUMBERS._fields, 1)}}, "that of other inputs"),
+    ],
+)
+def test_absurd_content_of_a_calibration_is_named_with_its_field(folder, content, message):
+    training.save_calibration(folder, NUMBERS, STATE.inputs)
+    storage.write_json(folder / "calibration.json", content)
+    listed = storage.read_manifest(folder, "")
+    storage.write_manifest(folder, listed.files | storage.checksums(folder, ["calibration.json"]), listed.facts)
+    with pytest.raises(storage.DamagedFileError, match=rf"calibration\.json .*{message}"):
+        training.load(folder)
+
+
+def test_a_calibration_that_the_manifest_does_not_list_is_not_used_without_a_word(folder):
+    storage.write_json(folder / "calibration.json", {})
+    with pytest.warns(UserWarning, match=r"calibration\.json is not used, .*Calibrate again"):
+        assert training.load(folder).calibration is None
 
 
 def test_a_new_checkpoint_drops_the_calibration(folder):

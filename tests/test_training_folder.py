@@ -106,6 +106,46 @@ def edit(path, old, new):
     path.write_text(text.replace(old, new))
 
 
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("metrics.jsonl", '{"step": 4, "loss": "low"}\n', r"metrics\.jsonl is no training log .*terms\.loss.*is 'low'"),
+        ("metrics.jsonl", '{"loss": 1.0}\n', r"metrics\.jsonl is no training log .*step is missing"),
+        ("metrics.jsonl", "[]\n", r"metrics\.jsonl is no training log"),
+        ("manifest.json", {"step": "four"}, r"manifest\.json is that of another folder .*facts\.step"),
+        ("manifest.json", {"step": 4, "log": 3}, r"manifest\.json is that of another folder .*facts\.log is 3"),
+        ("blank.npz", {"visual": np.zeros((4, 4), np.uint8), "tactile": IMAGE}, r"blank\.npz .*array visual is uint8"),
+        ("blank.npz", {"visual": IMAGE}, r"blank\.npz .*array tactile is missing"),
+    ],
+)
+def test_absurd_content_with_a_valid_checksum_is_named_with_its_field(folder, name, content, message):
+    files, facts = model_folder.manifest(folder)
+    if name == "manifest.json":
+        facts = content
+    elif isinstance(content, dict):
+        np.savez(folder / name, **content)
+        files |= storage.checksums(folder, [name])
+    else:
+        (folder / name).write_text(content)
+        facts |= {"log": {"bytes": len(content), "sha256": storage.sha256(folder / name)}}
+    storage.write_manifest(folder, files, facts)
+    with pytest.raises(storage.DamagedFileError, match=message):
+        read_all(folder) if name != "blank.npz" else training.load_blank(folder)
+
+
+def test_the_split_of_a_training_is_recorded_and_compared(tmp_path, finished):
+    rows = {"train": np.arange(6), "test": np.array([6, 7])}
+    training.claim_split(tmp_path, rows)
+    training.claim_split(tmp_path, {"train": [0], "test": [1]})  # nothing is trained yet
+    training.claim_split(tmp_path, rows)
+    training.save_blank(tmp_path, IMAGE, IMAGE)
+    train(tmp_path)
+    training.claim_split(tmp_path, rows)
+    with pytest.raises(ValueError, match="was trained with another split of the dataset"):
+        training.claim_split(tmp_path, {"train": [0, 1, 2, 3, 4, 7], "test": [6, 5]})
+    training.claim_split(finished[0], rows)  # an older model has no record
+
+
 def test_a_checkpoint_of_another_model_gives_one_short_message(folder, state, capfd):
     wider = training.initial(CONFIG, training.learner(mvae.Config(SMALL.modalities, latent=4, hidden=9)), 4)[1]
     with pytest.raises(ValueError, match=r"00000004 cannot be read .* [Bb]elongs to another model") as caught:

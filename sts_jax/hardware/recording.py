@@ -16,6 +16,7 @@ import json
 import math
 import os
 import time
+import zlib
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
@@ -103,7 +104,8 @@ class Recorder:
             frame = av.VideoFrame.from_ndarray(shot.image, format="rgb24").reformat(format=video.pix_fmt)
             frame.pts = round(1000 * (shot.time_s - self._start_s))
             container.mux(video.encode(frame))
-            facts = {"stream": shot.stream, **shot_facts(shot)}
+            pixels = zlib.crc32(np.ascontiguousarray(shot.image)) if self._encoding == "ffv1" else None
+            facts = {"stream": shot.stream, **shot_facts(shot), "pixels": pixels}
             self._lines.write((json.dumps({**facts, "checksum": storage.digest(facts)}) + "\n").encode())
         except OSError as error:
             self._end()
@@ -215,9 +217,9 @@ class Replay:
 
     def _play(self, start_s: float) -> Iterator[Shot]:
         """The images, from a time on the clock `time.monotonic` (s)."""
-        speed, first_s = self._speed or 1.0, self._stills[0].time_s
+        speed, first_s = self._speed or 1.0, self._stills[0][0].time_s
         frames = {stream: _frames(self.folder / f"{stream}.mkv") for stream in ("visual", "tactile")}
-        for still in self._stills:
+        for still, pixels in self._stills:
             frame = next(frames[still.stream])
             due_s = start_s + (still.time_s - first_s) / speed
             if self._speed is not None:
@@ -226,6 +228,8 @@ class Replay:
                     continue
                 time.sleep(max(due_s - time.monotonic(), 0.0))
             image = frame.to_ndarray(format="rgb24")
+            if pixels not in (None, zlib.crc32(image)):
+                raise DamagedFileError(f"{self.folder / f'{still.stream}.mkv'} has a damaged image: {_AGAIN}.")
             image.flags.writeable = False
             before, shift_s = still.before, due_s - still.time_s / speed
             sent_s, acknowledged_s = (time_s / speed + shift_s for time_s in (before.sent_s, before.acknowledged_s))
@@ -234,8 +238,8 @@ class Replay:
             yield dataclasses.replace(still, image=image, time_s=due_s, before=before, until_s=until_s)
 
 
-def _recorded(folder: Path) -> list[Shot]:
-    """The images of a recording, without their pixels."""
+def _recorded(folder: Path) -> list[tuple[Shot, int | None]]:
+    """The images of a recording, without their pixels, and the CRC-32 of their pixels in a lossless video."""
     manifest = storage.read_manifest(folder, _AGAIN, _Facts)
     if manifest is None:
         raise FileNotFoundError(f"{folder} holds no recording: give the folder of a recording.")
@@ -251,12 +255,13 @@ def _recorded(folder: Path) -> list[Shot]:
             if checksum not in (None, storage.digest(facts)) or stream not in ("visual", "tactile"):
                 raise ValueError(f"its checksum differs, or {stream!r} is no stream")
             del facts["stream"]
+            pixels = facts.pop("pixels", None)
             still = shot_of(_NO_IMAGE, stream, facts)
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise DamagedFileError(f"{folder / FRAMES}, line {number}, is damaged ({error}): {_AGAIN}.") from error
         left[still.stream] -= 1
         if left[still.stream] >= 0:
-            stills.append(still)
+            stills.append((still, pixels))
     return stills
 
 
