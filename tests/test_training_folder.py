@@ -136,13 +136,13 @@ def test_absurd_content_with_a_valid_checksum_is_named_with_its_field(folder, na
 def test_the_split_of_a_training_is_recorded_and_compared(tmp_path, finished):
     rows = {"train": np.arange(6), "test": np.array([6, 7])}
     training.claim_split(tmp_path, rows)
-    training.claim_split(tmp_path, {"train": [0], "test": [1]})  # nothing is trained yet
+    training.claim_split(tmp_path, {"train": np.array([0]), "test": np.array([1])})  # nothing is trained yet
     training.claim_split(tmp_path, rows)
     training.save_blank(tmp_path, IMAGE, IMAGE)
     train(tmp_path)
     training.claim_split(tmp_path, rows)
     with pytest.raises(ValueError, match="was trained with another split of the dataset"):
-        training.claim_split(tmp_path, {"train": [0, 1, 2, 3, 4, 7], "test": [6, 5]})
+        training.claim_split(tmp_path, {"train": np.arange(1, 7), "test": np.array([0, 7])})
     training.claim_split(finished[0], rows)  # an older model has no record
 
 

@@ -65,10 +65,10 @@ def record(folder: Path, part: str, inputs: Mapping[str, str], files: Sequence[P
 
 def _parts(manifest: storage.Manifest | None) -> dict[str, Part]:
     """The parts of the results that a manifest records. Facts of other folders are left out."""
-    parts = {}
-    for name, fact in ({} if manifest is None else manifest.facts).items():
+    parts, (files, facts) = {}, manifest or storage.Manifest({}, {})
+    for name, fact in facts.items():
         if not isinstance(fact, dict) or "files" not in fact:  # an older record, whose part has all files
-            fact = {"inputs": fact, "files": list(manifest.files)}
+            fact = {"inputs": fact, "files": list(files)}
         with contextlib.suppress(ValueError):
             parts[name] = storage.decode(Part, fact, name)
     return parts

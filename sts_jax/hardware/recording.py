@@ -104,7 +104,7 @@ class Recorder:
             frame = av.VideoFrame.from_ndarray(shot.image, format="rgb24").reformat(format=video.pix_fmt)
             frame.pts = round(1000 * (shot.time_s - self._start_s))
             container.mux(video.encode(frame))
-            pixels = zlib.crc32(np.ascontiguousarray(shot.image)) if self._encoding == "ffv1" else None
+            pixels = zlib.crc32(shot.image.tobytes()) if self._encoding == "ffv1" else None
             facts = {"stream": shot.stream, **shot_facts(shot), "pixels": pixels}
             self._lines.write((json.dumps({**facts, "checksum": storage.digest(facts)}) + "\n").encode())
         except OSError as error:
@@ -228,7 +228,7 @@ class Replay:
                     continue
                 time.sleep(max(due_s - time.monotonic(), 0.0))
             image = frame.to_ndarray(format="rgb24")
-            if pixels not in (None, zlib.crc32(image)):
+            if pixels not in (None, zlib.crc32(image.tobytes())):
                 raise DamagedFileError(f"{self.folder / f'{still.stream}.mkv'} has a damaged image: {_AGAIN}.")
             image.flags.writeable = False
             before, shift_s = still.before, due_s - still.time_s / speed

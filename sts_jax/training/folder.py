@@ -236,7 +236,7 @@ def records(folder: Path) -> list[Record]:
     return some
 
 
-def claim_split(folder: Path, split: Mapping[str, ArrayLike]) -> None:
+def claim_split(folder: Path, split: Mapping[str, np.ndarray]) -> None:
     """Record the split of the dataset in the manifest of a model, or compare it with that of its training.
 
     Call it before the training, and before the model is scored, so that this never happens on its training data.
@@ -245,7 +245,7 @@ def claim_split(folder: Path, split: Mapping[str, ArrayLike]) -> None:
         split: Indices of the objects or trajectories in each part, such as `train`.
     """
     listed = manifest(folder) or storage.Manifest({}, {"step": None})
-    checksum = storage.digest({name: np.asarray(part).tolist() for name, part in split.items()})
+    checksum = storage.digest({name: part.tolist() for name, part in split.items()})
     if listed.facts["step"] is None:
         storage.write_manifest(folder, listed.files, {**listed.facts, "split": checksum})
     elif listed.facts.get("split", checksum) != checksum:
