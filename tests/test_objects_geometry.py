@@ -235,3 +235,63 @@ def test_an_impossible_size_mass_or_thickness_is_named(tmp_path, size, arguments
 
 def test_a_dense_body_of_lead_is_accepted(tmp_path):
     assert objects.load(saved(tmp_path, box(20, 20, 20)), mass=0.09).shell_mass == pytest.approx(0.09)
+
+
+SECTIONS = 32
+
+
+def lathe(*outline: tuple[float, float]) -> trimesh.Trimesh:
+    """A solid of revolution of an outline (mm), counter-clockwise."""
+    return trimesh.creation.revolve(np.array(outline) * 1e-3, sections=SECTIONS)
+
+
+def disc(radius: float) -> float:
+    """Area of a section of a `lathe` (mm^2)."""
+    return SECTIONS / 2 * np.sin(2 * np.pi / SECTIONS) * radius**2
+
+
+CUP = lathe((0, 0), (30, 0), (30, 80), (28, 80), (28, 4), (0, 4))
+
+
+@pytest.mark.parametrize("turn", [(0, (1, 0, 0)), (90, (1, 0, 0)), (180, (1, 0, 0)), (90, (0, 1, 0))])
+def test_contents_fill_the_cavity_of_a_cup_whose_wall_counts_once(tmp_path, turn):
+    cup = CUP.copy()
+    cup.apply_transform(trimesh.transformations.rotation_matrix(np.deg2rad(turn[0]), turn[1]))
+    body = objects.load(saved(tmp_path, cup), density=2.0, strict=True)
+    assert volume(body) == pytest.approx(disc(28) * 76e-9, rel=1e-4)
+    assert body.shell_mass == pytest.approx(cup.area, rel=1e-5)  # 2 kg/m^2 on one of two sides
+    for up in ((0.0, 0.0, 1.0), (0.6, 0.0, 0.8)):
+        assert objects.fill_moments(body.interior, 0.5, up)[0] == pytest.approx(disc(28) * 38e-9, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "content"),
+    [
+        (lathe((0, 0), (30, 0), (30, 80), (20, 80), (20, 10), (0, 10)), disc(20) * 70),  # thicker than the cavity
+        (lathe((0, 0), (30, 0), (30, 60), (12, 80), (12, 100), (10, 100), (10, 80), (28, 60), (28, 3), (0, 3)), None),
+        (
+            trimesh.util.concatenate(
+                [lathe((0, 0), (30, 0), (30, 80), (0, 80)), lathe((0, 2), (28, 2), (28, 78), (0, 78))]
+            ),
+            disc(28) * 76,
+        ),
+        (trimesh.creation.torus(0.03, 0.01), trimesh.creation.torus(0.03, 0.01).volume * 1e9),  # holds nothing
+    ],
+    ids=["thick", "bottle", "sealed", "torus"],
+)
+def test_contents_of_other_shapes(tmp_path, mesh, content):
+    if content is None:  # of the bottle: a cylinder, a cone and the neck
+        content = disc(28) * 57 + (disc(28) + disc(10) + disc(1) * 280) * 20 / 3 + disc(10) * 20
+    assert volume(objects.load(saved(tmp_path, mesh), strict=True)) == pytest.approx(content * 1e-9, rel=1e-4)
+
+
+def test_an_uneven_rim_spills_at_its_lowest_point(tmp_path):
+    cup = CUP.copy()
+    x, y, z = cup.vertices.T
+    cup.vertices = np.c_[x, y, z + np.where(z > 0.079, 0.004 * np.sin(2 * np.arctan2(y, x)), 0)]
+    assert volume(objects.load(saved(tmp_path, cup))) == pytest.approx(disc(28) * 72e-9, rel=2e-3)
+
+
+def test_a_solid_cup_and_a_cup_of_a_mass_hold_nothing(tmp_path):
+    for arguments in ({"mass": 0.2}, {"hollow": False}):
+        assert objects.load(saved(tmp_path, CUP), **arguments).contents_density == 0

@@ -14,6 +14,7 @@ from scipy.spatial import ConvexHull, QhullError
 from sts_jax._checked import checked
 from sts_jax.objects.assembly import CONTENTS, STEEL, WALL, assemble
 from sts_jax.objects.body import FACE_CLASSES, PAD, Body, check_category
+from sts_jax.objects.cavities import OPEN, find_cavity
 from sts_jax.objects.checks import (
     ROUNDING,
     check_density,
@@ -106,9 +107,10 @@ def load(
             an error for a mesh that is longer than the pad.
         mass: Mass of the body (kg), spread over its surface. The body then has no contents. None computes the mass
             of the shell from `density`.
-        density: Mass of the shell per area (kg/m^2), if `mass` is None.
+        density: Mass of the shell per area (kg/m^2), if `mass` is None. A thick wall, as of a cup, counts once.
         hollow: If True and `mass` is None, the body can hold contents of 1,000 kg/m^3. The filled share is an argument
-            of `rigid`. The convex hull bounds the contents of a mesh that is not closed, with a warning.
+            of `rigid`. In a closed mesh with thick walls, as of a cup, the contents fill the cavity, not the walls. The
+            convex hull bounds the contents of a mesh that is not closed, with a warning.
         strict: If True, a mesh that is not closed or encloses no volume is an error, and so are missing images and
             materials, and parts of the file that are not supported.
         up: Axis of the file, or direction in the file, that becomes +z. The convention of glTF files is "y".
@@ -222,6 +224,7 @@ def _body(
         raise ValueError("the mesh is flat, so even its convex hull has no volume: give it a thickness") from error
     interior = (vertices, faces)
     holds = hollow and mass is None
+    cavity = None
     if not (closed and enclosed > 1e-6 * hull.volume):
         fault = "encloses no volume" if closed else "is not closed"
         if strict:
@@ -237,11 +240,15 @@ def _body(
             interior = (points, _outward(points, ConvexHull(points)))
         else:
             interior = (vertices, _outward(vertices, hull))
+    elif holds and hull.volume > (1 + OPEN) * enclosed:
+        cavity = find_cavity(vertices, faces, enclosed)
+        if cavity is not None:
+            interior = (cavity.reshape(-1, 3), np.arange(3 * len(cavity)).reshape(-1, 3))
     return assemble(
         vertices,
         faces,
         colors,
-        density=np.full(len(faces), density),
+        density=np.full(len(faces), density if cavity is None else density / 2),  # the wall has two sides
         interior=interior if holds else None,
         contents_density=CONTENTS if holds else 0.0,
         mass=mass,
