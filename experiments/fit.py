@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 
 import sts_jax as sts
 from experiments.shared import drawing, laying
-from experiments.shared.terminal import on_one_line
+from experiments.shared.terminal import check_numbers, on_one_line
 from sts_jax import tactile
 
 # Standard deviations of the Gaussian blur that is applied to images before they are compared (m). The first one is
@@ -175,8 +175,7 @@ def draw(config: Config, target: np.ndarray, paths: list[list[tuple[np.ndarray, 
 def main(config: Config) -> None:
     """Render a tactile image of the object on the pad, fit the pose to it several times, and draw the result."""
     laying.check(config)
-    if config.starts < 1:
-        raise ValueError(f"--starts is {config.starts}, but it must be at least 1")
+    check_numbers(config, starts=(1, 1000))
     if config.force == 0:
         raise ValueError("--force is 0, but it must be > 0 (N), so that the object leaves an imprint")
     sensor = sts.Sensor() if config.sensor is None else sts.Sensor.load(config.sensor)

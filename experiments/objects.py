@@ -70,8 +70,9 @@ def describe(category: str, number: int, body: sts.objects.Body, *, parts: bool)
 
 def main(config: Config) -> None:
     """Make the objects, print their descriptions, and draw them in one picture."""
-    if config.num < 1:
-        raise ValueError(f"--num is {config.num}, but the number of objects per class must be at least 1")
+    terminal.check_numbers(config, num=(1, 1000), seed=terminal.SEEDS, size=terminal.SIDES)
+    if not config.categories:
+        raise ValueError("--categories is empty, but it must name at least one class, such as bottle")
     families = {category: sts.objects.find_family(category) for category in config.categories}
     drawing.check_picture(config.out)
     key = jax.random.key(config.seed)

@@ -38,6 +38,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Simulate the trajectories, render them from outside and through the sensor, and draw them."""
+    terminal.check_numbers(config, num=(1, 1000), seed=terminal.SEEDS, size=terminal.SIDES)
     drawing.make_folder(config.out)
     sensor = sts.Sensor()
     collection = dataclasses.replace(SCENARIOS[config.scenario], num_objects=config.num, seed=config.seed)

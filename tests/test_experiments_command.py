@@ -11,7 +11,7 @@ import pytest
 import trimesh
 
 import sts_jax as sts
-from experiments import freefall, inclined, perturbed, released
+from experiments import fit, freefall, inclined, objects, perturbed, released, sense, show
 from experiments.shared import config, evaluate, run, terminal
 from sts_jax import compilation, dataset, physics, storage, training
 
@@ -174,6 +174,25 @@ def test_a_wrong_field_is_an_error_before_anything_is_written(fields, message, t
     with pytest.raises(ValueError, match=message):
         run.configure(run.Args(tmp_path / "run", wrong))
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("command", "config", "option"),
+    [
+        (show, show.Config("freefall", out=Path("unused"), seed=10**20), "seed"),
+        (objects, objects.Config(num=10**20), "num"),
+        (objects, objects.Config(size=-1), "size"),
+        (fit, fit.Config("mouse", starts=0), "starts"),
+        *((sense, sense.Config("mouse", **{name: float("nan")}), name) for name in ("mass", "force", "height", "turn")),
+        (sense, sense.Config("mouse", position=(float("inf"), 0.0)), "position"),
+        (sense, sense.Config("mouse", resolution=(10**6, 10**6)), "resolution"),
+    ],
+)
+def test_a_number_out_of_range_is_named_before_any_work(command, config, option, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=f"--{option} is .*, but it must be from "):
+        command.main(config)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("number", ["99999999999999999999", "1" + "0" * 400, "-99999999999999999999", "1e999", "nan"])

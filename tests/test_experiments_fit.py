@@ -71,7 +71,7 @@ def test_the_wrench_moves_with_the_pose():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"starts": 0}, "starts is 0, but it must be at least 1"),
+        ({"starts": 0}, "starts is 0, but it must be from 1 to 1,000"),
         ({"force": 0.0}, "force is 0, but it must be > 0"),
         ({"position": (0.3, 0.0), "resolution": SMALL}, "scissors leaves no imprint in view"),
     ],

@@ -200,11 +200,11 @@ def test_reviewing(workdir, capsys):
     ("options", "message"),
     [
         ({}, "--sensor is missing: give the sensor file"),
-        ({"sensor": Path("none.json"), "count": 0}, "count must be >= 1, got 0"),
+        ({"sensor": Path("none.json"), "count": 0}, "count is 0, but it must be from 1 to"),
         ({"sensor": Path("none.json")}, "none.json"),
         ({"sensor": Path("none.json"), "size": (320, 240)}, "--size is .*, but the sensor file none.json determines"),
         ({"twin": True, "camera": "/dev/video0"}, "--camera and --twin exclude each other"),
-        ({"twin": True, "size": (0, 480)}, "at least 1 pixel"),
+        ({"twin": True, "size": (0, 480)}, r"size is \(0, 480\), but it must be from 1"),
     ],
 )
 def test_bad_options_are_named(tmp_path, options, message):

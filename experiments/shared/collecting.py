@@ -14,7 +14,7 @@ import sts_jax as sts
 from experiments.shared import commissioning, drawing, interrupts
 from experiments.shared.device import FIELD_OF_VIEW, TwinConfig, make_twin
 from experiments.shared.page import CollectPage
-from experiments.shared.terminal import Bar, Terminal, say
+from experiments.shared.terminal import SEEDS, SIDES, Bar, Terminal, check_numbers, say
 from sts_jax import hardware, storage
 from sts_jax.hardware import Action, AutomaticPerson, EmptyPad, GuideConfig, Person, Stage, View, twin
 
@@ -107,8 +107,7 @@ def collect(config: Collect) -> None:
 
 def check_options(config: Collect) -> None:
     """Refuse options that exclude each other."""
-    if config.count is not None and config.count < 1:
-        raise ValueError(f"--count must be >= 1, got {config.count}")
+    check_numbers(config, count=(1, 1_000_000), seed=SEEDS, size=SIDES)
     given = [f"--{name}" for name in ("sensor", "camera", "leds") if getattr(config, name) is not None]
     if config.twin and given:
         raise ValueError(f"{given[0]} and --twin exclude each other: leave out one of them")

@@ -16,6 +16,7 @@ import tyro
 
 import sts_jax as sts
 from experiments.shared import commissioning
+from experiments.shared.terminal import SEEDS, SIDES, check_numbers
 from sts_jax.hardware import twin
 
 FIELD_OF_VIEW = 160.0  # field of view across the diagonal (degrees), that of the paper's device
@@ -54,8 +55,9 @@ class TwinConfig:
 
 def make_twin(config: TwinConfig, *, first: int = 0, prepare: bool = True) -> twin.Twin:
     """Make a twin that begins with the trajectory number `first`, and prepare its first images."""
-    if min(config.resolution) < 1:
-        raise ValueError(f"--resolution must be at least 1 pixel high and wide, got {config.resolution}")
+    check_numbers(
+        config, resolution=SIDES, rate=(0.1, 1000), field_of_view=(1, 359), motion_rate=(0.01, 1000), seed=SEEDS
+    )
     sensor = sts.Sensor()
     scene = twin.ObjectScene(
         sts.objects.make(jax.random.key(config.seed), config.object_class),

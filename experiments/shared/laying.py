@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 import sts_jax as sts
 from experiments.shared import drawing
+from experiments.shared.terminal import SEEDS, SIDES, check_numbers
 
 G = 9.81  # gravity (m/s^2)
 FILL = 0.5  # share of a container's interior that is filled
@@ -47,10 +48,19 @@ class Placed:
 
 def check(config: Placed) -> None:
     """Check the options before any work."""
+    check_numbers(
+        config,
+        resolution=SIDES,
+        position=(-1, 1),
+        height=(-1, 1),
+        turn=(-1e6, 1e6),
+        tilt=(-1e6, 1e6),
+        mass=(0, 1000),
+        force=(0, 1e6),
+        seed=SEEDS,
+    )
     if config.mass is not None and config.mass <= 0:
         raise ValueError(f"--mass is {config.mass}, but it must be > 0 (kg)")
-    if config.force is not None and config.force < 0:
-        raise ValueError(f"--force is {config.force}, but it must be >= 0 (N)")
     drawing.check_picture(config.out)
 
 

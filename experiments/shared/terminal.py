@@ -27,6 +27,8 @@ CORRECTABLE = (
     hardware.CameraError,
     hardware.LightError,
 )
+SEEDS = 0, 2**32 - 1  # least and largest seed
+SIDES = 1, 8192  # least and largest side of an image (pixels)
 LINES = {"": Action.CONFIRM, "d": Action.DISCARD, "q": Action.STOP}
 _EVERY_S = 10.0  # time between two lines of progress where standard error is not a terminal (s)
 
@@ -86,6 +88,15 @@ def on_one_line(*, debug: bool = False) -> Iterator[None]:
         raise SystemExit(f"error: an option has too large a number for this computer: {reason}") from None
     finally:
         warnings.formatwarning = usual
+
+
+def check_numbers(config: Any, **limits: tuple[float, float]) -> None:
+    """Raise a ValueError for the first option with a number outside its limits (low, high), NaN included."""
+    for name, (low, high) in limits.items():
+        value = getattr(config, name)
+        for number in value if isinstance(value, tuple) else (value,):
+            if number is not None and not low <= number <= high:
+                raise ValueError(f"--{name.replace('_', '-')} is {value}, but it must be from {low:,} to {high:,}")
 
 
 def _note(message: Warning | str, *_: Any, **__: Any) -> str:
