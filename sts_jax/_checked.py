@@ -26,7 +26,7 @@ def in_32_bits(function: Callable[P, R]) -> Callable[P, R]:
 
     @functools.wraps(function)
     def run(*args: P.args, **kwargs: P.kwargs) -> R:
-        if _settings() == (False, "standard", "allow"):
+        if current_settings() == (False, "standard", "allow"):
             return function(*args, **kwargs)
         args, kwargs = jax.tree.map(_rounded, (args, kwargs))
         with settings(False):
@@ -35,8 +35,8 @@ def in_32_bits(function: Callable[P, R]) -> Callable[P, R]:
     return run
 
 
-def _settings() -> tuple[bool, str, str]:
-    config = jax.config
+def current_settings() -> tuple[bool, str, str]:
+    config: Any = jax.config  # whose attributes mypy does not know
     return config.jax_enable_x64, config.jax_numpy_dtype_promotion, config.jax_numpy_rank_promotion
 
 

@@ -7,6 +7,7 @@ import platform
 import tempfile
 import warnings
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -58,8 +59,9 @@ def enable_compilation_cache(folder: str | os.PathLike[str] | None = None) -> Pa
     jax.config.update("jax_compilation_cache_dir", kept and str(kept))
     # By default JAX keeps only programs that took a second to compile, but a session runs hundreds of smaller ones.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0 if problem is None else math.inf)
+    config: Any = jax.config
     # JAX sets the variable to 1 if it is not set.
-    if os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1" and jax.config.jax_logging_level in (None, "NOTSET"):
+    if os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1" and config.jax_logging_level in (None, "NOTSET"):
         jax.config.update("jax_logging_level", "CRITICAL")  # of XLA and of JAX
         jax.config.update("jax_logging_level", "NOTSET")  # of JAX alone
     return kept

@@ -87,11 +87,12 @@ def outputs():
 
 
 def trained():
-    """Loss of one training step."""
+    """Results of one training step."""
     config = training.TrainConfig(steps=2, batch_size=4)
     learner = training.learner(SMALL)
     graphdef, state = training.initial(config, learner, 2)
-    return training.step(learner, graphdef, config, 2, state, arrays().take(np.arange(4)))
+    batch = jax.tree.map(jnp.asarray, arrays().take(np.arange(4)))
+    return training.step(learner, graphdef, config, 2, state, batch)
 
 
 @pytest.mark.slow

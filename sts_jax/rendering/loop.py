@@ -18,7 +18,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, ArrayLike
 
-from sts_jax._checked import settings
+from sts_jax._checked import current_settings, settings
 from sts_jax._devices import on_each_device
 
 Flat = Callable[..., list[Array]]
@@ -48,7 +48,7 @@ def looped(function: Callable[..., Any]) -> Callable[..., Any]:
 def _looped(given: Flat) -> Flat:
     """`looped` for a function from arrays to a list of arrays."""
     # JAX traces the function again for batches and derivatives, then with the caller's settings.
-    x64 = jax.config.jax_enable_x64
+    x64, *_ = current_settings()
 
     def function(*leaves: Array) -> list[Array]:
         with settings(x64):
