@@ -264,7 +264,8 @@ def append(folder: Path, record: Record) -> None:
 def resume_log(folder: Path) -> list[Record]:
     """Remove the records after the current checkpoint from the training log, and return the others."""
     kept = records(folder)
-    storage.write_bytes(folder / LOG, "".join(json.dumps(record) + "\n" for record in kept).encode())
+    listed = manifest(folder)
+    storage.write_bytes(folder / LOG, b"" if listed is None else _logged(folder, listed))
     return kept
 
 
