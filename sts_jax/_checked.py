@@ -2,11 +2,15 @@
 
 import contextlib
 import functools
+import sys
 import typing
+import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping
+from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 import jax
+import jaxtyping
 import numpy as np
 from beartype import BeartypeConf, beartype
 from jaxtyping import jaxtyped
@@ -14,6 +18,7 @@ from jaxtyping import jaxtyped
 # Check array shapes and argument types by the annotations. An int is accepted for a float (PEP 484).
 checked = jaxtyped(typechecker=beartype(conf=BeartypeConf(is_pep484_tower=True)))
 
+_INSIDE = (str(Path(__file__).parent), str(Path(jaxtyping.__file__).parent), "<@beartype")  # files of the entry points
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -52,6 +57,14 @@ def _rounded(leaf: Any) -> Any:
     if isinstance(leaf, jax.Array) and leaf.dtype in ("float64", "int64", "uint64", "complex128"):
         return leaf.astype(str(leaf.dtype).replace("64", "32").replace("128", "64"))
     return leaf
+
+
+def warn(problem: str) -> None:
+    """Warn, at the line that called the library."""
+    frame, level = sys._getframe(1), 2
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(_INSIDE):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(problem, stacklevel=level)
 
 
 def check_key(key: Any) -> None:

@@ -1,6 +1,7 @@
 """Images that the sensor takes of an object: visual image, tactile image, depth and segmentation."""
 
 import dataclasses
+import math
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +9,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Real
 
 from sts_jax import optics
-from sts_jax._checked import checked, in_32_bits
+from sts_jax._checked import checked, in_32_bits, warn
+from sts_jax._plausible import placement_problem
 from sts_jax._ranges import MOST_PIXELS
 from sts_jax.objects.body import FACE_CLASSES, Body, is_traced
 from sts_jax.rendering import drawing, equilibrium
@@ -68,11 +70,14 @@ def sense(
     """Render the images that the sensor takes of one object. Works under `jit`, `vmap` and `grad`.
 
     With a wrench, the object sinks and tilts until the gel balances Fz, Mx and My (`tactile.settle`). Without one, it
-    stays in the given pose. An object that is wholly inside the sensor (z < 0) is not drawn.
+    stays in the given pose. An object that is wholly inside the sensor (z < 0) is not drawn: z = -1 m gives images of
+    the empty sensor.
 
     The images also show an empty sensor, and `Frame.balanced` is False, if the pose or the wrench is not finite, the
     quaternion's squared length is zero or infinite in float32, or a traced sensor or body has invalid values. An
-    invalid sensor or body that is not traced raises a ValueError (`Sensor.check`, `Body.check`).
+    invalid sensor or body that is not traced raises a ValueError (`Sensor.check`, `Body.check`). A pose or wrench that
+    is not traced and probably wrong is drawn with a warning: not finite, in millimetres, out of view, below the pad, or
+    a load far beyond what the pad bears.
 
     Args:
         body: One body. For several bodies use `objects.stack` and `jax.vmap`.
@@ -97,6 +102,7 @@ def sense(
             f"body has {len(body.faces):,} faces, but at most {FACE_CLASSES[-1]:,} can be drawn: decimate the mesh "
             f"with objects.load(path, faces={FACE_CLASSES[-1]})"
         )
+    placed = sensor, body, pose, wrench  # as given, with the hulls
     pose = jnp.asarray(pose, float)
     wrench = None if wrench is None else jnp.asarray(wrench, float)
     sensor, sound = sensor.guard()
@@ -109,6 +115,8 @@ def sense(
     # Two programs, so that a new resolution compiles only the second one.
     resting = equilibrium.balance(sensor.gel, sound, body.vertices, body.faces, body.two_sided, pose, wrench)
     images = drawing.draw(sensor, body, resting, resolution=resolution, crop=crop, moving_edges=moving_edges)
+    if not is_traced(placed) and (problem := _problem(*placed, resolution)):  # JAX draws meanwhile
+        warn(problem)
     return Frame(
         visual=images.visual,
         tactile=images.tactile,
@@ -118,6 +126,26 @@ def sense(
         balanced=resting.balanced,
         pressure=resting.pressure,
         window=images.window,
+    )
+
+
+def _problem(
+    sensor: Sensor, body: Body, pose: ArrayLike, wrench: ArrayLike | None, resolution: tuple[int, int]
+) -> str | None:
+    """What is probably wrong with a placement. Values that an accelerator still computes are not waited for."""
+    for value in (pose, wrench):
+        if jax.default_backend() != "cpu" and not getattr(value, "is_ready", lambda: True)():
+            return None
+    camera, gel = sensor.camera, sensor.gel
+    high = float(camera.distance) * math.tan(float(camera.fov) / 2)
+    wide = high * min(float(camera.aspect), resolution[1] / resolution[0])
+    return placement_problem(
+        np.asarray(pose, np.float64),
+        None if wrench is None else np.asarray(wrench, np.float64),
+        np.asarray(body.hulls).reshape(-1, 3),
+        np.array([wide, wide * resolution[0] / resolution[1]]),
+        float(camera.distance),
+        gel,
     )
 
 

@@ -15,10 +15,12 @@ from flax import nnx
 from jaxtyping import Array, ArrayLike, Bool, Key, Num
 
 from sts_jax import mvae, statespace, storage, training
-from sts_jax._checked import checked, in_32_bits
+from sts_jax._checked import checked, in_32_bits, warn
+from sts_jax._plausible import image_problem, order_problem, pair_problem, pose_problem
 from sts_jax.prediction import Prediction, completed, flagged, predict, predict_samples
 
-MODALITIES = ("visual", "tactile", "pose")
+STREAMS = ("visual", "tactile")
+MODALITIES = (*STREAMS, "pose")
 MODELS = Path(str(importlib.resources.files("sts_jax"))) / "models"  # trained models of the library, one folder each
 _QUAT_TOLERANCE = 1e-2  # largest deviation of a quaternion's length from 1
 _FARTHEST = 10.0  # m, largest coordinate of a position. A larger number is probably in millimetres
@@ -28,7 +30,7 @@ _LARGEST_CONDITION = 100.0  # largest condition, as a multiple of its usual magn
 _CHUNK = {"cpu": 16}
 _PER_ITEM = ("mean", "log_var", "outcome_probability")  # the same for all samples of an item
 
-Images = Num[Array | np.ndarray, "*n h w 3"]
+Images = Num[Array | np.ndarray, "..."]  # (*n, h, w, 3). `Predictor` compares the shape, for a better message
 Poses = Num[Array | np.ndarray, "*n 7"]
 Numbers = Num[Array | np.ndarray, "*n c"]
 Kind = Literal["image", "pose", "vector"]  # each kind of inputs has its own range
@@ -38,7 +40,7 @@ class Predictor:
     """A trained model as a function: `predictor(visual=image)` returns a `Prediction`.
 
     The prediction is the last frame, in which the object has come to rest. `Predictor.load("freefall")` loads a model
-    that comes with the library, and `Predictor.load("runs/freefall/models/statespace")` one that you trained. Calls are
+    that comes with the library, and `Predictor.load("runs/freefall")` one that you trained. Calls are
     pure, work inside `jax.jit`, `jax.vmap` and `jax.grad`, and may run in several threads. The prediction of an item
     does not depend on the other items of its batch. Outside `jax.jit`, the memory does not grow with the batch.
     """
@@ -78,8 +80,8 @@ class Predictor:
         self.preprocessing = preprocessing
         self.name = name
         self._blank = blank
-        images = (jnp.asarray(image.astype(np.float32) / 255) for image in blank)
-        self._empty = dict(zip(("visual", "tactile"), images, strict=True))
+        self._blank_of = {name: image.astype(np.float32) / 255 for name, image in zip(STREAMS, blank, strict=True)}
+        self._empty = {name: jnp.asarray(image) for name, image in self._blank_of.items()}
 
     @classmethod
     @in_32_bits
@@ -87,8 +89,8 @@ class Predictor:
         """Load a trained model, after comparing its files with their checksums.
 
         Args:
-            folder: Folder of a model, or the name of a model that comes with the library, such as `freefall`. A folder
-                of this name in the current directory that contains `config.json` comes first.
+            folder: The name of a model that comes with the library, such as `freefall`, the folder of a model, or the
+                work directory of an experiment with one model. Write `./freefall` for a folder of a library's name.
         """
         path = _located(folder)
         model = training.load(path)
@@ -160,7 +162,8 @@ class Predictor:
         """Predict the last frame of trajectories from their first frames.
 
         Pass at least one input. All arrays have the same leading axes *n. Outside `jax.jit`, an invalid value raises an
-        error. Inside, an item with an invalid traced value gives a prediction of NaN.
+        error, and an image or pose that is probably wrong gives a warning (BGR, noise, no object in view, another
+        sensor, a pose of another image). Inside, an item with an invalid traced value gives a prediction of NaN.
 
         Args:
             visual: Visual images in [0, 1].
@@ -184,7 +187,10 @@ class Predictor:
         leads = {name: array.shape[: array.ndim - len(self._shapes[name])] for name, array in inputs.items()}
         lead = next(iter(leads.values()))
         if len(set(leads.values())) > 1:
-            raise ValueError(f"the leading axes differ: {leads}. Pass arrays with the same leading axes.")
+            raise ValueError(
+                f"the leading axes differ: {leads}. Pass arrays with the same leading axes: add a missing axis of the "
+                "batch with array[None]."
+            )
         if num_samples < 0 or (num_samples and key is None):
             raise ValueError(f"num_samples={num_samples} and key={key}: give num_samples >= 0, and a key if it is > 0.")
         if key is not None and key.shape not in ((), lead):
@@ -203,7 +209,11 @@ class Predictor:
                 valid.append(fine | ignored)
             elif not np.all(fine | ignored):
                 raise ValueError(_reason(name, self._kinds[name], np.asarray(array)[~(fine | ignored)]))
-        return self._predicted(inputs, masks, lead, condition, valid, key, num_samples)
+        predicted = self._predicted(inputs, masks, lead, condition, valid, key, num_samples)
+        # JAX computes the prediction meanwhile.
+        for problem in dict.fromkeys(filter(None, self._problems(inputs, masks, lead))):
+            warn(problem)
+        return predicted
 
     @in_32_bits
     @checked
@@ -258,7 +268,29 @@ class Predictor:
     @property
     def empty(self) -> dict[str, np.ndarray]:
         """Images of the empty sensor, `visual` and `tactile`: float32 (height, width, 3) in [0, 1]."""
-        return {name: np.asarray(image) for name, image in self._empty.items()}
+        return {name: image.copy() for name, image in self._blank_of.items()}
+
+    def _problems(self, inputs: dict[str, Any], present: dict[str, Any], lead: tuple[int, ...]) -> Iterator[str | None]:
+        """Messages about inputs in range that are probably wrong, or None. Traced values are not examined."""
+        config, crop = self.model.config, self.preprocessing.crop
+        masks = {name: present.get(name, np.True_) for name in MODALITIES if name in inputs}
+        given = {name for name, mask in masks.items() if not _traced(inputs[name]) and not _traced(mask)}
+        used = {name: np.broadcast_to(masks[name], lead) for name in given}
+        for item in np.ndindex(lead):
+            values = {name: inputs[name][item] for name in given if used[name][item]}
+            problems = [
+                image_problem(name, values[name], self._blank_of[name], crop=crop) for name in STREAMS if name in values
+            ]
+            yield from problems
+            if any(problems) or crop or "visual" not in values:
+                continue
+            if "tactile" in values:
+                yield pair_problem(values["visual"], values["tactile"], self._blank_of)
+            if "pose" in values and isinstance(config, statespace.Config):
+                blank = self._blank_of["visual"]
+                yield pose_problem(values["visual"], blank, values["pose"], config.camera_distance, config.view)
+        if "pose" in given:
+            yield order_problem(inputs["pose"][used["pose"]][:, 3:])
 
     def _input(self, name: str, value: ArrayLike) -> np.ndarray | Array:
         """Check the name, type and shape of an input, and return it as float32. A traced value stays traced."""
@@ -281,7 +313,7 @@ class Predictor:
         if array.ndim < len(tail) or array.shape[array.ndim - len(tail) :] != tail:
             raise ValueError(
                 f"{name} has shape {array.shape}, but {self.name} needs shape (..., {', '.join(map(str, tail))})"
-                + (f": render with resolution={tail[:2]}." if is_image and name in MODALITIES else ".")
+                + (_misshapen(array.shape, tail) if is_image else ".")
             )
         return _float32(array)
 
@@ -354,6 +386,21 @@ def _float32(array: Any) -> Any:
         return array.astype(np.float32)
 
 
+def _misshapen(shape: tuple[int, ...], tail: tuple[int, ...]) -> str:
+    """What is wrong with the shape of images, as the end of a message."""
+    last, channels = shape[-1] if shape else 0, tail[-1]
+    if last == channels and len(shape) >= len(tail):
+        return f": render with resolution={tail[:2]}."
+    if last == channels + 1:
+        return f": the images have {last} channels (RGBA?). Leave out the transparency: image[..., :{channels}]."
+    if len(shape) >= len(tail) and shape[-3] in (channels, channels + 1):
+        return ": the channels are first. Move them to the end: np.moveaxis(image, -3, -1)."
+    if last == 1 or shape[-2:] == tail[:2] or (len(shape) > 1 and min(shape[-2:]) > channels + 1):
+        grey = "image" if last == 1 else "image[..., None]"
+        return f": the images are grey. Give {channels} channels: np.repeat({grey}, {channels}, -1)."
+    return f": the last axis must be the {channels} channels."
+
+
 def _in_range(kind: Kind, array: Any) -> Any:
     """Find the items of a batch whose numbers are in the range of their kind, with JAX only if they are traced."""
     xp = jnp if _traced(array) else np
@@ -386,13 +433,19 @@ def _reason(name: str, kind: Kind, items: np.ndarray) -> str:
 
 
 def _located(folder: str | Path) -> Path:
+    """The folder of a model, given as `Predictor.load` describes."""
     path, name = Path(folder), str(folder)
-    if name != path.name or (path / "config.json").exists():
-        return path
     names = sorted(config.parent.name for config in MODELS.glob("*/config.json"))
-    if name not in names:
+    if name in names:
+        return MODELS / name
+    models = sorted(config.parent for config in path.glob("models/*/config.json"))
+    if len(models) > 1:
+        raise ValueError(f"{folder} has {len(models)} models: give one of {', '.join(map(str, models))}.")
+    if models:
+        return models[0]
+    if name == path.name and not (path / "config.json").exists():
         raise FileNotFoundError(
             f"{name!r} is neither a folder with a config.json nor one of the trained models that come with sts_jax "
             f"({', '.join(names) or 'none'}): give one of these names, or the folder of a trained model."
         )
-    return MODELS / name
+    return path

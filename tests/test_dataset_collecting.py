@@ -266,6 +266,12 @@ def test_an_edited_description_is_named_and_deleted_files_are_made_again_with_th
     assert dataset.load(copied).identity == dataset.load(folder).identity != dataset.load(sparse).identity
 
 
+def test_the_work_directory_of_an_experiment_stands_for_its_dataset(folder, tmp_path):
+    (tmp_path / "dataset").symlink_to(folder)
+    storage.write_manifest(tmp_path, {}, {})  # of the evaluation
+    assert dataset.load(tmp_path).identity == dataset.load(folder).identity
+
+
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [

@@ -67,6 +67,45 @@ def test_an_invalid_argument_raises_an_error_that_names_it(call, error, message)
             each()
 
 
+def posed(x=0.0, y=0.0, z=0.01, quat=(1, 0, 0, 0)):
+    return np.array([x, y, z, *quat], np.float32)
+
+
+UNLIKELY = [
+    (posed(50, 20, 10), WRENCH, "in metres, not in millimetres"),
+    (posed(0.003, np.nan), WRENCH, "pose has NaN"),
+    (posed(quat=(1, 0, np.inf, 0)), None, "pose has NaN or infinite"),
+    (posed(quat=(0, 0, 0, 0)), None, "quaternion of length 0"),
+    (posed(0.15), WRENCH, "out of the camera's view"),
+    (posed(0, -0.2), None, "out of the camera's view"),
+    (posed(z=-0.05), WRENCH, "out of the camera's view"),
+    (posed(z=-0.005), None, "below the pad: is the quaternion in the order w, x, y, z"),
+    (posed(quat=(0, 0.7071068, 0, 0.7071068)), None, "below the pad: is the quaternion"),
+    (posed(), np.full(6, np.nan), "wrench has NaN"),
+    (posed(), 1000 * WRENCH, "force in N and the moment in N m"),
+    (posed(), np.array([0, 0, 1.0, 50, 0, 0], np.float32), "force in N and the moment in N m"),
+]
+
+
+@pytest.mark.parametrize(("pose", "wrench", "message"), UNLIKELY)
+def test_a_placement_that_is_probably_wrong_is_drawn_with_a_warning(pose, wrench, message):
+    for kind in (np.asarray, jnp.asarray):
+        given = kind(pose), None if wrench is None else kind(wrench)
+        with pytest.warns(UserWarning, match=message) as caught:
+            sense(SENSOR, BODY, *given, resolution=(16, 16))
+        assert [warning.filename for warning in caught] == [__file__]
+    jax.jit(lambda pose: sense(SENSOR, BODY, pose, wrench, resolution=(16, 16)))(pose)  # not of traced values
+
+
+@pytest.mark.parametrize(
+    "pose",
+    [posed(0.074, 0.074), posed(-0.09), posed(0.1, 0, 0.0), posed(z=0.6), posed(0.3, 0, 0.9), posed(z=-1), POSE],
+)
+def test_a_likely_placement_is_drawn_without_a_warning(pose):
+    """On the edge, partly beside the pad, far above, and nowhere."""
+    sense(SENSOR, BODY, pose, WRENCH, resolution=(16, 16))
+
+
 def test_an_invalid_traced_body_pose_or_wrench_gives_the_empty_sensor():
     draw = jax.jit(functools.partial(sense, resolution=(16, 16)))
     gone = draw(SENSOR, BODY, POSE.at[2].set(-1), WRENCH)

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxtyping import TypeCheckError
 from scipy import optimize
 from statespace_config import STATE, finite, same, state_model, untrained
 
@@ -18,7 +17,7 @@ from sts_jax.predict import MODELS
 from sts_jax.prediction import predict
 
 SIDE = 32
-
+pytestmark = pytest.mark.filterwarnings("ignore:(visual|tactile|pose) ")  # the images and poses are random
 
 MODALITIES = (
     mvae.Modality("visual", "image", (SIDE, SIDE, 3)),
@@ -128,17 +127,33 @@ CONDITION = np.array([[4.0, -9.0, 0.07], [-4.0, 9.0, 0.12]], np.float32)
     [
         ({}, ValueError, "nothing to predict from: give at least one of visual, tactile, pose"),
         ({"visual": GIVEN["visual"][:, 1:]}, ValueError, r"has shape \(2, 31, 32, 3\).*resolution=\(32, 32\)"),
+        (
+            {"visual": GIVEN["visual"][..., 0]},
+            ValueError,
+            r"are grey.*np\.repeat\(image\[\.\.\., None\], 3",
+        ),
+        ({"visual": GIVEN["visual"][0, :, :, :1]}, ValueError, r"are grey.*np\.repeat\(image, 3, -1\)"),
+        ({"visual": np.zeros((2, 48, 64), np.float32)}, ValueError, "are grey"),
+        ({"visual": GIVEN["visual"][..., [0, 1, 2, 2]]}, ValueError, r"4 channels \(RGBA\?\).*image\[\.\.\., :3\]"),
+        (
+            {"tactile": np.moveaxis(GIVEN["tactile"], -1, 1)},
+            ValueError,
+            r"are first.*np\.moveaxis\(image, -3, -1",
+        ),
+        ({"visual": GIVEN["visual"][..., :2]}, ValueError, "the last axis must be the 3 channels"),
+        ({"visual": GIVEN["visual"].reshape(2, -1)}, ValueError, "the last axis must be the 3 channels"),
+        ({"visual": GIVEN["visual"][0], "pose": GIVEN["pose"]}, ValueError, r"leading axes differ.*array\[None\]"),
         ({"visual": GIVEN["visual"] * 255}, ValueError, "visual has values in .*divide by 255"),
         ({"visual": (GIVEN["visual"] * 255).astype(np.uint8)}, ValueError, "visual is uint8.*divide"),
         ({"tactile": GIVEN["tactile"] * np.nan}, ValueError, "tactile has NaN"),
         ({"pose": np.where(np.arange(7) == 4, 1e30, POSE)}, ValueError, r"quaternion of length 1e\+30"),
         ({"pose": POSE + 40 * np.eye(7, dtype=np.float32)[0]}, ValueError, "give metres"),
-        ({**GIVEN, "pose": POSE}, TypeCheckError, "pose"),
+        ({**GIVEN, "pose": POSE}, ValueError, r"leading axes differ.*'pose': \(\)"),
         ({**GIVEN, "state": np.zeros((2, statespace.STATE_CODE))}, ValueError, "does not accept state"),
         ({**GIVEN, "condition": np.zeros((2, 3))}, ValueError, r"condition has shape \(2, 3\), but .* needs None"),
         ({**GIVEN, "present": {"pose": np.ones(2)}}, ValueError, r"present\['pose'\] is float64"),
         ({**GIVEN, "num_samples": 3}, ValueError, "and a key if it is > 0"),
-        ({"pose": POSE, "key": jax.random.split(jax.random.key(0)), "num_samples": 1}, TypeCheckError, "key"),
+        ({"pose": POSE, "key": jax.random.split(jax.random.key(0)), "num_samples": 1}, ValueError, "key has shape"),
     ],
 )
 @pytest.mark.parametrize("jit", [False, True])
@@ -334,8 +349,20 @@ def test_a_model_of_the_library_is_loaded_by_its_name(state_predictor, predictor
         sts.Predictor.load("freefal")
     with pytest.raises(FileNotFoundError, match=r"falls has no config\.json"):
         sts.Predictor.load(tmp_path / "falls")
-    predictor.save("falls")
-    assert sts.Predictor.load("falls").model.config == predictor.model.config
+    predictor.save("falls")  # a model of the library comes first, unless the name has a slash
+    assert sts.Predictor.load("falls").model.config == STATE
+    assert sts.Predictor.load("./falls").model.config == predictor.model.config
+
+
+def test_the_work_directory_of_an_experiment_stands_for_its_only_model(state_predictor, predictor, tmp_path):
+    workdir = tmp_path / "run"
+    (workdir / "dataset").mkdir(parents=True)
+    (workdir / "config.json").write_text("{}")
+    state_predictor.save(workdir / "models/statespace")
+    assert sts.Predictor.load(workdir).model.config == STATE
+    predictor.save(workdir / "models/mvae")
+    with pytest.raises(ValueError, match=r"has 2 models: give one of .*models/mvae, .*models/statespace"):
+        sts.Predictor.load(workdir)
 
 
 def test_models_of_the_library_are_small_calibrated_and_name_their_outcomes():

@@ -133,7 +133,7 @@ class Live:
         self._waiting: collections.deque[tuple[hardware.Shot, hardware.Shot]] = collections.deque(maxlen=1)
         self._changed, self._stopped = threading.Event(), False
         self._error: Exception | None = None
-        self._compute(self._untouched, contact=True)
+        self._compute(self._untouched, occupied=False, contact=True)
         self._thread = threading.Thread(target=self._run, name="predictions", daemon=True)
         self._thread.start()
 
@@ -175,18 +175,20 @@ class Live:
         observation = collecting.observe(tactile.time_s, visual.image, tactile.image)
         contact = collecting.has_contact(hardware.GuideConfig(), self._empty, observation)
         change = np.abs(observation.visual - self._empty.mean.visual).max(-1)
+        occupied = contact or int((change > _OCCUPIED).sum()) >= _BLOCKS
         view = self._views.prepared(visual.image, tactile.image, self._untouched)
-        out = self._compute(view._asdict(), contact=contact)
+        out = self._compute(view._asdict(), occupied=occupied, contact=contact)
         chances = [] if out.outcome_probability is None else np.asarray(out.outcome_probability).tolist()
         names = self._predictor.outcomes or tuple(f"outcome {number}" for number in range(len(chances)))
-        occupied = contact or int((change > _OCCUPIED).sum()) >= _BLOCKS
         outcomes = list(zip(names, chances, strict=True))
         return Predicted(_shown(out.visual), _shown(out.tactile), outcomes, contact, occupied)
 
-    def _compute(self, views: Mapping[str, np.ndarray], *, contact: bool) -> sts.Prediction:
-        """Predict from images in the view of the sensor. The tactile image is ignored unless `contact` is True."""
+    def _compute(self, views: Mapping[str, np.ndarray], *, occupied: bool, contact: bool) -> sts.Prediction:
+        """Predict from images in the view of the sensor. An image of the empty pad or without contact is ignored."""
         touch = views["tactile"] if self._touches else None
-        present: dict[str, ArrayLike] | None = None if touch is None else {"tactile": np.bool_(contact)}
+        present: dict[str, ArrayLike] = {"visual": np.bool_(occupied)}
+        if touch is not None:
+            present["tactile"] = np.bool_(contact)
         out = self._predictor(visual=views["visual"], tactile=touch, condition=self._condition, present=present)
         return jax.block_until_ready(out)
 

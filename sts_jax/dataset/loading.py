@@ -263,6 +263,9 @@ class Dataset:
 def load(folder: str | Path) -> Dataset:
     """Open and verify a dataset that `collect` has finished. The verification takes about 1 s per GB.
 
+    Args:
+        folder: Folder of the dataset, or the work directory of an experiment, which has it in `dataset/`.
+
     Raises:
         FileNotFoundError: The folder has no dataset, or `collect` has not finished it.
         DamagedFileError: A file is damaged, or belongs to another dataset or shard. The message names the file.
@@ -270,6 +273,8 @@ def load(folder: str | Path) -> Dataset:
     folder = Path(folder)
     if folder.is_file():
         raise NotADirectoryError(f"{folder} is a file: give the folder of a collected dataset.")
+    if not (folder / "collection.json").exists() and (folder / "dataset" / "collection.json").exists():
+        folder /= "dataset"
     manifest = records.manifest_of(folder)
     if manifest is None:
         raise FileNotFoundError(f"{folder} is not a collected dataset: give another folder, or call `collect`.")
