@@ -34,9 +34,10 @@ def cut(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "_ 3"]:
     if backwards:
         ring = np.roll(ring[::-1], 1)
     corners = points[ring] - points[ring[0]]
-    normal = np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0)  # twice the area (Newell)
+    wedges = np.cross(corners[1:-1], corners[2:])
+    normal = wedges.sum(axis=0)  # twice the area (Newell)
     area, grain = np.linalg.norm(normal), 1e-12 * np.ptp(corners, axis=0).max() ** 2
-    if (np.cross(corners[1:-1], corners[2:]) @ normal >= -grain * area).all() and area > grain:
+    if (wedges @ normal >= -grain * area).all() and area > grain:
         return ring[fan[:, ::-1] if backwards else fan]  # convex
     if num > LONGEST:
         raise Refusal(f"a concave face has {num:,} corners, but at most {LONGEST:,} are cut: split it into triangles")
