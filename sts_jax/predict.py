@@ -16,6 +16,7 @@ from jaxtyping import Array, ArrayLike, Bool, Key, Num
 
 from sts_jax import mvae, statespace, storage, training
 from sts_jax._checked import checked, in_32_bits, warn
+from sts_jax._devices import on_each_device
 from sts_jax._plausible import image_problem, order_problem, pair_problem, pose_problem
 from sts_jax.prediction import Prediction, completed, flagged, predict, predict_samples
 
@@ -245,9 +246,12 @@ class Predictor:
             more = *shared, num_samples, lead, model.calibration
             return predict_samples(graphdef, state, view, self._empty, inputs, present, *more)
 
+        def of_device(given: tuple, _: tuple) -> Prediction:
+            return run(given, next(iter(jax.tree.leaves(given))).shape[: len(lead)] if inputs else lead)
+
         chunk, count = _CHUNK.get(jax.default_backend(), 256), math.prod(lead)
         if count <= chunk or any(map(_traced, jax.tree.leaves((given, key)))):
-            result = run(given, lead)
+            result = on_each_device(of_device, given, (), _axes(num_samples)) if lead else run(given, lead)
         else:
             flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(lead) :]), given)
             result = _joined([run(part, (chunk,)) for part in _cut(flat, chunk, count)], lead)
@@ -369,6 +373,13 @@ def _joined(parts: list[Prediction], lead: tuple[int, ...], *, axis: int = 0) ->
         if name != "samples" and (leaves := [getattr(part, name) for part in parts])
     }
     return Prediction(**merged, samples=_joined(drawn, lead, axis=1) if drawn else None)
+
+
+def _axes(num_samples: int) -> Prediction:
+    """The axis of the items in the arrays of a prediction."""
+    axes: dict[str, Any] = dict.fromkeys(Prediction._fields, 0)
+    of_samples = Prediction(**{name: 0 if name in _PER_ITEM else 1 for name in axes})
+    return Prediction(**(axes | {"samples": of_samples if num_samples else 0}))
 
 
 def _traced(value: object) -> bool:
