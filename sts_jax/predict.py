@@ -378,8 +378,8 @@ def _joined(parts: list[Prediction], lead: tuple[int, ...], *, axis: int = 0) ->
 def _axes(num_samples: int) -> Prediction:
     """The axis of the items in the arrays of a prediction."""
     axes: dict[str, Any] = dict.fromkeys(Prediction._fields, 0)
-    of_samples = Prediction(**{name: 0 if name in _PER_ITEM else 1 for name in axes})
-    return Prediction(**(axes | {"samples": of_samples if num_samples else 0}))
+    samples: dict[str, Any] = {name: 0 if name in _PER_ITEM else 1 for name in axes}
+    return Prediction(**(axes | {"samples": Prediction(**samples) if num_samples else 0}))
 
 
 def _traced(value: object) -> bool:
