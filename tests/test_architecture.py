@@ -13,11 +13,11 @@ ROOMS = [
     for name, paths, lines, budget in re.findall(r"^\| ([^|`]+) \| (`[^|]+) \| ([\d,]+) \| ([\d,]+) \|$", PAGE, re.M)
 ]
 TOTALS = {
-    "library without hardware": 17_300,
-    "hardware": 4_980,
-    "experiments": 3_820,
+    "library without hardware": 19_230,
+    "hardware": 5_070,
+    "experiments": 4_020,
     "benchmarks": 4_470,
-    "tests": 16_020,
+    "tests": 18_150,
 }
 
 
