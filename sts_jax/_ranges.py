@@ -51,7 +51,8 @@ def check(config: Any, owner: str = "") -> None:
             raise ValueError(f"{owner}{field.name} must be finite, got {value!r}")
         number = value
         if metadata.get("whole"):
-            number, metadata = min(max(value, -_LARGEST), _LARGEST), {"at_most": _LARGEST - 1, **metadata}
-        for holds, words in limits(metadata, np.asarray(number)):
+            number = min(max(value, -_LARGEST), _LARGEST)
+        bounds = {"at_most": _LARGEST - 1, **metadata} if metadata.get("whole") else metadata
+        for holds, words in limits(bounds, np.asarray(number)):
             if not holds:
                 raise ValueError(f"{owner}{field.name} {words.removeprefix('it ')}, got {value!r}")

@@ -230,8 +230,9 @@ def take(config: Config, sensor: hardware.STS, corners: Corners) -> None:
     lay = _FIRST not in corners
     wait(_LAY if lay else _HOLD, config.every)
     next(sensor.stream(0.0))  # turns the lights off
-    first = hardware.find_board(sensor.camera.read().image, config.board)
-    image = sensor.camera.read().image
+    camera = cast(hardware.OpenCVCamera, sensor.camera)  # of `opened`
+    first = hardware.find_board(camera.read().image, config.board)
+    image = camera.read().image
     seen = hardware.find_board(image, config.board)
     _, before, after = np.intersect1d(first.numbers, seen.numbers, return_indices=True)
     moved = np.hypot(*(seen.pixels[after] - first.pixels[before]).T) if len(before) else np.array([np.inf])
