@@ -189,11 +189,10 @@ def placement_problem(
     planes = np.array([[1, 0, -right], [-1, 0, -right], [0, 1, -down], [0, -1, -down], [0, 0, -1]])  # of the view
     if ((planes @ placed).min(axis=1) > (*view.repeat(2), 0)).any():
         return "pose puts the object out of the camera's view: give its position (m) in the sensor frame, z upwards."
-    sunk = placed[2] < -float(gel.thickness)
-    if sunk.any() and (sunk & (abs(placed[0]) < width / 2) & (abs(placed[1]) < height / 2)).any():
+    if (placed[2].min() + placed[2].max()) / 2 < -float(gel.thickness) and abs(x) < width / 2 and abs(y) < height / 2:
         return (
-            "pose puts a part of the object below the pad: is the quaternion in the order w, x, y, z, and the position "
-            "that of the mesh frame in the sensor frame (m)?"
+            "pose puts the object below the pad: is the quaternion in the order w, x, y, z, and the position that of "
+            "the mesh frame in the sensor frame (m)?"
         )
     return None
 
