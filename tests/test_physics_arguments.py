@@ -38,7 +38,7 @@ ARGUMENTS = [
     ({"key": 0}, r"key is 0, but it must be a JAX key, such as jax\.random\.key\(0\)"),
     ({"num": 0}, "num is 0, but it must be a whole number"),
     ({"num": 10**10}, "num is 10000000000, .* from 1 to 100,000,000"),
-    ({"num": 10**7}, r"num is 10000000, which gives 600,000,000 frames .* GB: call it several times"),
+    ({"num": 10**7}, r"num is 10000000, which gives 600,000,000 frames.* GB: call it several times"),
     ({"chunk": 10**10}, "chunk is 10000000000, .* from 1 to 100,000,000"),
     ({"progress": "bar"}, "progress is 'bar', but it must be True, False or a function"),
     ({"engine": "bullet"}, "engine is 'bullet', but it must be 'mjx' or 'mujoco'"),

@@ -110,11 +110,11 @@ def _over_batch(
     if not any(flags):
         return jax.vmap(dense, in_axes=None, axis_size=size)(*leaves)
 
-    def merged(items: list[Array], shared: list[Array]) -> list[Array]:
+    def merged(items: list[ArrayLike], shared: list[ArrayLike]) -> list[ArrayLike]:
         mapped, whole = iter(items), iter(shared)
         return [next(mapped if flag else whole) for flag in flags]
 
-    def of_device(items: list[Array], shared: list[Array]) -> list[Array]:
+    def of_device(items: list[ArrayLike], shared: list[ArrayLike]) -> list[Array]:
         if jax.default_backend() == "cpu":
             return jax.lax.map(lambda item: single(*merged(item, shared)), items)
         return jax.vmap(lambda item: dense(*merged(item, shared)))(items)
