@@ -1,6 +1,6 @@
 """Results that a change of the structure must not change: predictions of the shipped models, and a whole small run.
 
-The golden files were written before the code was restructured (commit 8585f93). After a deliberate change of a result:
+The code was restructured with these tests (until commit 77b8c8f). After a deliberate change of a result:
 
     python -m experiments.freefall --preset smoke --workdir SMOKE && python -m tests.golden.make SMOKE
 
