@@ -103,9 +103,9 @@ def test_a_sensor_of_a_file_is_used(box, tmp_path, capsys):
     ("changes", "message"),
     [
         ({"mesh": "teapot"}, r"teapot is neither a file nor an object class \(bottle, camera"),
-        ({"resolution": (0, 64)}, r"resolution \(height, width\) must be > 0, got \(0, 64\)"),
+        ({"resolution": (0, 64)}, r"--resolution is \(0, 64\), but it must be from 1 to 8,192"),
         ({"mass": 0.0}, "mass is 0.0, but it must be > 0"),
-        ({"force": -1.0}, "--force is -1.0, but it must be >= 0"),
+        ({"force": -1.0}, "--force is -1.0, but it must be from 0 to "),
         ({"light": 1.5}, "light is 1.5"),
         ({"rest": 99}, r"--rest is 99, but it must be the index of a face, from 0 to \d+"),
         ({"mesh": "bottle", "longest_side": 0.1}, "--longest-side is for mesh files, but bottle is an object class"),
