@@ -35,7 +35,7 @@ def starts(text):
 @pytest.mark.parametrize("mesh", ["seven", "scissors"])
 def test_starts_3_mm_and_10_degrees_off_end_within_200_um_and_1_degree(mesh, seven, tmp_path, capsys):
     out = tmp_path / "fit.png"
-    mass = 0.1 if mesh == "seven" else None
+    mass = 0.05 if mesh == "seven" else None
     fit.main(fit.Config(seven if mesh == "seven" else mesh, out=out, mass=mass, resolution=SMALL, starts=3))
     text = capsys.readouterr().out
     found = starts(text)

@@ -96,7 +96,7 @@ def test_fitted_contrast_has_the_gradient_energy_of_the_true_images():
     params["decoder"]["last"]["bias"][...] += 3.0  # an untrained decoder covers hardly any pixel
     chunks = list(calibration._chunks(given.inputs, given.empty, given.condition, chosen, np.arange(NUMBER)))
     given = jax.tree.map(jnp.asarray, chunks[0])  # a call draws its samples for a whole chunk
-    num, key = calibration._SAMPLES, jax.random.key(0)
+    num, key = calibration._SAMPLES, jax.random.split(jax.random.key(0), calibration._CHUNK)
     noise = np.random.default_rng(1).random((NUMBER, STATE.image_size, STATE.image_size, 3))
     noise /= np.sqrt(evaluation.metrics.gradient_energy(noise))[:, None, None, None]
     for contrast in calibration.CONTRASTS:
