@@ -39,14 +39,15 @@ def _end(reader: int) -> None:
 def in_order() -> Iterator[None]:
     """Let Ctrl-C and SIGTERM raise a KeyboardInterrupt, so that devices and recordings are closed.
 
-    Nothing changes in a program that has not called `end_at_once`.
+    Nothing changes in a program that has not called `end_at_once`. In the background of a shell, Ctrl-C stays ignored.
     """
-    command = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is _ignore
-    if not command:
+    interrupt = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or interrupt not in (_ignore, signal.SIG_IGN):
         yield
         return
     writer = signal.set_wakeup_fd(-1)
-    before = {number: signal.signal(number, _raise) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)}
+    numbers = [signal.SIGTERM, signal.SIGALRM, *([signal.SIGINT] if interrupt is _ignore else [])]
+    before = {number: signal.signal(number, _raise) for number in numbers}
     try:
         yield
     finally:

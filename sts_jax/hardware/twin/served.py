@@ -18,6 +18,7 @@ from sts_jax.hardware.twin.device import Twin, TwinFrame
 CAMERA = "/camera"
 COMMANDS = ("hold", "release", "clear")
 _WAIT_S = 0.1  # longest time until waiting threads notice that they must stop (s)
+_CLOSE_S = 1.0  # longest wait for clients when the server is closed (s)
 _TICK_S = 0.003  # longest wait for bytes, after which the watchdog is checked (s)
 _BUFFER = 1 << 16  # size of a connection's send buffer (bytes). With a larger one, a slow client gets older frames
 _KEPT = 32  # largest number of frames that wait for their delivery to a client
@@ -197,6 +198,10 @@ class Served:
         if self._stop.is_set():
             return
         self._stop.set()
+        # The threads of the clients must end before Python does, which would otherwise abort the process.
+        deadline = time.monotonic() + _CLOSE_S
+        while self._web.clients and time.monotonic() < deadline:
+            time.sleep(_TICK_S)
         self._web.shutdown()
         self._web.server_close()
         for thread in self._threads:
