@@ -153,11 +153,14 @@ def bars(samples=4, *, further=False):
 
 @pytest.mark.slow
 def test_a_killed_run_of_a_state_space_model_ends_with_the_same_bits(tmp_path):
-    whole = training.train(STATE_CONFIG, STATE, bars(further=True), workdir=tmp_path / "whole")
+    data = {"arrays": bars(further=True), "validation": bars(3)}
+    whole = training.train(STATE_CONFIG, STATE, **data, workdir=tmp_path / "whole")
     with pytest.raises(Killed):
-        training.train(STATE_CONFIG, STATE, bars(further=True), workdir=tmp_path / "killed", progress=kill_at(3))
-    model = training.train(STATE_CONFIG, STATE, bars(further=True), workdir=tmp_path / "killed")
+        training.train(STATE_CONFIG, STATE, **data, workdir=tmp_path / "killed", progress=kill_at(3))
+    model = training.train(STATE_CONFIG, STATE, **data, workdir=tmp_path / "killed")
     same(model.state, whole.state)
+    best = [training.calibrate(tmp_path / name / "best", bars()) for name in ("whole", "killed")]
+    same(*((each.state, each.calibration) for each in best))
     log = (tmp_path / "whole" / "metrics.jsonl").read_text()
     assert (tmp_path / "killed" / "metrics.jsonl").read_text() == log
     losses = [json.loads(line)["loss"] for line in log.splitlines()]

@@ -1,4 +1,4 @@
-"""Loading of a dataset as arrays: trajectories, rendered images, and pairs of first and last frames."""
+"""Loading of a dataset as arrays: trajectories, rendered images, and pairs of frames, by default the first and last."""
 
 import concurrent.futures
 import dataclasses
@@ -20,9 +20,9 @@ from sts_jax.storage import DamagedFileError, Finite, decode, digest, read_array
 
 
 class Pairs(NamedTuple):
-    """First and last frames of n trajectories.
+    """Two frames of each of n trajectories: by default the first and the last, or those of `frame`.
 
-    In arrays of shape `(n, 2, ...)`, index 0 of the second axis is the first frame and index 1 is the last frame.
+    In arrays of shape `(n, 2, ...)`, index 0 of the second axis is the earlier frame and index 1 is the later frame.
     """
 
     visual: np.ndarray  # uint8 (n, 2, height, width, 3): images of the visual stream
@@ -31,7 +31,7 @@ class Pairs(NamedTuple):
     pose: np.ndarray  # float32 (n, 2, 7): mesh frame in the sensor frame, position (m) and quaternion
     contact: np.ndarray  # bool (n, 2): true if the pad pushes on the object
     condition: np.ndarray  # float32 (n, c): input of the scenario such as a jerk (SI units)
-    outcome: np.ndarray  # int32 (n,): number of the outcome, one of `Scenario.outcomes`
+    outcome: np.ndarray  # int32 (n,): number of the outcome of the whole trajectory, one of `Scenario.outcomes`
     object: np.ndarray  # int32 (n,): index of the object in the collection
     trajectory: np.ndarray  # int64 (n,): index of the trajectory in the dataset
     support: np.ndarray  # float32 (n, 128): support function of the body (m), see `objects.support`
@@ -39,6 +39,7 @@ class Pairs(NamedTuple):
     com: np.ndarray  # float32 (n, 3): centre of mass in the mesh frame (m)
     # (n, 2, *shape) each: the values of further modalities by name, uint8 or float32, NaN where not measured
     measurements: dict[str, np.ndarray] = {}  # noqa: RUF012 (never changed)
+    frame: np.ndarray | None = None  # int64 (n, 2): indices of both frames in the trajectory (None: unknown)
 
     def take(self, rows: np.ndarray | slice) -> "Pairs":
         """Select trajectories by indices, a bool mask `(n,)`, or a slice such as `slice(10)`."""
@@ -224,12 +225,56 @@ class Dataset:
             )
         return trajectories.astype(np.int64)
 
-    def pairs(self, trajectories: np.ndarray, *, measurements: Sequence[Measurement] = ()) -> Pairs:
-        """Read the first and last frames of trajectories that have images.
+    def stored(self, trajectories: np.ndarray, frames: np.ndarray) -> np.ndarray:
+        """Indices into `self.frames` of frames of trajectories, for `images`. The arguments are int, of one shape."""
+        place = np.full(self.trajectory["time"].shape, -1)
+        place[self.frames[:, 0], self.frames[:, 1]] = np.arange(len(self.frames))
+        rows = place[trajectories, frames]
+        if (lacking := np.argwhere(rows < 0)).size:
+            one = tuple(lacking[0])
+            raise ValueError(
+                f"trajectory {trajectories[one]} has no image of frame {frames[one]}: take trajectories from "
+                "`full_trajectories`, or collect with a larger `num_full`."
+            )
+        return rows
+
+    def steps(self, trajectories: np.ndarray, stride: int = 1) -> np.ndarray:
+        """Rows (trajectory, t, t + stride) for every frame t of trajectories with images of all frames, int `(m, 3)`.
 
         Args:
             trajectories: Indices of the trajectories, int `(n,)`.
-            measurements: Further modalities to measure.
+            stride: Number of frames from the first to the second frame of each row.
+        """
+        index, length = self._checked(trajectories), self.trajectory["time"].shape[1]
+        if not isinstance(stride, int | np.integer) or not 1 <= stride < length:
+            raise ValueError(
+                f"stride is {stride!r}, but it must be a whole number from 1 to {length - 1}, because the trajectories "
+                f"have {length} frames."
+            )
+        lacking = index[~np.isin(index, self.full_trajectories())]
+        if lacking.size:
+            raise ValueError(
+                f"`trajectories` contains {lacking[0]}, of which not all frames are stored: take trajectories from "
+                "`full_trajectories`, or collect with `num_full` as large as the number of trajectories."
+            )
+        first = np.arange(length - stride)
+        return np.stack([x.ravel() for x in np.broadcast_arrays(index[:, None], first, first + stride)], axis=-1)
+
+    def pairs(
+        self,
+        trajectories: np.ndarray,
+        *,
+        frames: Sequence[int | np.ndarray] = (0, -1),
+        measurements: Sequence[Measurement] = (),
+    ) -> Pairs:
+        """Read two frames of each of n trajectories that have images.
+
+        Args:
+            trajectories: Indices of the trajectories, int `(n,)`.
+            frames: The two frames, by default the first and the last: numbers for all trajectories, or int `(n,)`. A
+                negative number counts from the end. Frames between the first and the last are stored for
+                `full_trajectories` only.
+            measurements: Further modalities to measure, for the first and last frames only.
         """
         index = self._checked(trajectories)
         without = index[~np.isin(index, self.rendered())]
@@ -238,17 +283,21 @@ class Dataset:
                 f"`trajectories` contains {without[0]}, which has no images: use `ends`, or take indices from "
                 "`members` or `rendered`."
             )
-        last = self.trajectory["pose"].shape[1] - 1
-        row_of = {tuple(row): i for i, row in enumerate(self.frames.tolist())}
-        rows = np.array([row_of[t, frame] for t in index.tolist() for frame in (0, last)], np.int64)
-        images = [leaf.reshape(-1, 2, *leaf.shape[1:]) for leaf in self.images(rows)]
-        ends = self.trajectory["pose"][index][:, [0, last]]
+        frame = self._frames(frames, len(index))
+        if measurements and (frame != self._frames((0, -1), len(index))).any():
+            raise ValueError(
+                f"frames is {frames!r}, but measurements exist for the first and last frames only: leave out "
+                "`measurements` or `frames`."
+            )
+        both = np.broadcast_to(index[:, None], frame.shape)
+        images = [leaf.reshape(-1, 2, *leaf.shape[1:]) for leaf in self.images(self.stored(both, frame).ravel())]
+        pose = self.trajectory["pose"][both, frame]
         return Pairs(
             visual=images[0],
             tactile=images[1],
             segmentation=images[2],
-            pose=np.concatenate([ends[..., :3], geometry.quat_canonical(ends[..., 3:])], -1),
-            contact=self.trajectory["contact"][:, [0, last]][index],
+            pose=np.concatenate([pose[..., :3], geometry.quat_canonical(pose[..., 3:])], -1),
+            contact=self.trajectory["contact"][both, frame],
             condition=self.trajectory["condition"][index],
             outcome=self.trajectory["outcome"][index],
             object=self.trajectory["body"][index],
@@ -257,7 +306,25 @@ class Dataset:
             mass=self.solid["mass"][index],
             com=self.solid["com"][index],
             measurements=measured(measurements, self, index),
+            frame=frame,
         )
+
+    def _frames(self, frames: Any, count: int) -> np.ndarray:
+        """Return two frames of each trajectory as indices from 0, int64 `(count, 2)`, or raise a ValueError."""
+        ends, length = [np.asarray(end) for end in frames], self.trajectory["time"].shape[1]
+        if len(ends) != 2 or any(end.dtype.kind not in "iu" or end.shape not in ((), (count,)) for end in ends):
+            raise ValueError(
+                f"frames is {frames!r}, but it must be two whole numbers, or two lists of {count} whole numbers, one "
+                "for each trajectory."
+            )
+        both = np.stack([np.broadcast_to(end, count) for end in ends], axis=-1).astype(np.int64)
+        outside = both[(both < -length) | (both >= length)]
+        if outside.size:
+            raise ValueError(
+                f"frames contains {outside[0]}, but the trajectories have the frames 0 to {length - 1}. A negative "
+                "number counts from the end."
+            )
+        return both % length
 
 
 def load(folder: str | Path) -> Dataset:

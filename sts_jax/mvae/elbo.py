@@ -75,8 +75,9 @@ def loss(
     beta: float | Float[Array, ""] = 1.0,
     asked: Literal["all", "own"] = "all",
     absent: tuple[str, ...] = (),
+    training: bool = True,
 ) -> tuple[Float[Array, ""], tuple[nnx.State, Terms]]:
-    """Compute the loss of one batch in training mode, see the docstring of the module.
+    """Compute the loss of one batch, see the docstring of the module.
 
     The `absent` modalities are removed from all subsets. If several subsets are then equal, the term of one subset is
     computed and multiplied by their number. For each modality, one call of the decoder predicts the targets for all
@@ -96,6 +97,7 @@ def loss(
         beta: Weight of the divergence of the posterior from the prior.
         asked: `all` predicts all modalities for each subset, `own` only its members, as in the paper's code.
         absent: Names of modalities that are not inputs of any sample.
+        training: True for the statistics of the batch in batch normalisation, False for the running ones.
 
     Returns:
         A tuple `(loss, (stats, terms))` with the loss, the new running batch statistics, and the terms of the loss.
@@ -105,7 +107,7 @@ def loss(
     _check(config, asked, absent, targets, {**inputs, **(present or {}), **(target_present or {})})
     absent = tuple(name for name in config.names if name in absent or name not in inputs)
     batch = len(next(iter(targets.values())))
-    experts, mask = _experts(model, inputs, present or {}, absent, batch, training=True)
+    experts, mask = _experts(model, inputs, present or {}, absent, batch, training=training)
 
     groups = _groups(config, asked, absent, empty=bool(present))  # only a mask can leave a sample without input
     members = jnp.array([[bool(g.members >> i & 1) for i in range(len(config.names))] for g in groups])
@@ -126,7 +128,9 @@ def loss(
         target = targets[modality.name]
         known = (target_present or {}).get(modality.name, jnp.ones(batch, bool))
         weights = (times[:, None] * counts[jnp.array(rows)] * known[None]).reshape(-1)
-        output = model.decoders[modality.name](z[jnp.array(rows)].reshape(-1, z.shape[-1]), weights)
+        output = model.decoders[modality.name](
+            z[jnp.array(rows)].reshape(-1, z.shape[-1]), weights if training else None
+        )
         target = jnp.where(_over(known, target), target, 0)
         error = _error(modality, output.reshape(len(rows), *target.shape), target[None])
         summed = jnp.sum(weights * error.reshape(-1)) / batch

@@ -9,6 +9,7 @@ from sts_jax.training.arrays import shifted as shifted
 from sts_jax.training.arrays import state_arrays as state_arrays
 from sts_jax.training.arrays import state_codes as state_codes
 from sts_jax.training.arrays import state_model as state_model
+from sts_jax.training.arrays import step_arrays as step_arrays
 from sts_jax.training.folder import Model as Model
 from sts_jax.training.folder import TrainState as TrainState
 from sts_jax.training.folder import calibrate as calibrate

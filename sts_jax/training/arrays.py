@@ -1,11 +1,11 @@
-"""Training arrays in memory: their batches, how they are made, and the model configurations that fit them."""
+"""Training arrays in memory or on disk: batches, how they are made, and the model configurations that fit them."""
 
 import dataclasses
 import functools
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from sts_jax import mvae, optics, physics, statespace
 from sts_jax._checked import checked, in_32_bits
-from sts_jax.dataset import Ends, Measurement, Pairs, Views, reduced_images
+from sts_jax.dataset import Dataset, Ends, Measurement, Pairs, Views, reduced_images
 from sts_jax.sensor import Sensor
 from sts_jax.training.preprocess import Preprocessing
 
@@ -22,16 +22,43 @@ Batch = dict[str, Any]  # the fields of `Arrays` by name, with the samples of on
 Config = mvae.Config | statespace.Config  # configuration of a model of either kind
 
 _CHUNK = 512  # number of items that are encoded at once
+_FRAMES = 256  # number of frames that are read at once
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """Images of the stored frames of a dataset, in memory or on disk. Several arrays of `Arrays` share one source."""
+
+    # Receives indices of stored frames, int (n,). Returns the images by name, uint8 (n, height, width, 3)
+    read: Callable[[np.ndarray], dict[str, np.ndarray]]
+    identity: str  # identity of the dataset and size of the images, for checksums
+
+
+@dataclass(frozen=True, eq=False)
+class Shared:
+    """An array of images, `images[i]` being an image of frame `rows[i]` of a source. `Arrays` reads a batch of them."""
+
+    source: Source
+    name: str  # `visual` or `tactile`
+    rows: np.ndarray  # int (samples,): indices of stored frames, see `Dataset.frames`
+    shape: tuple[int, ...]  # (samples, height, width, 3)
+    dtype: ClassVar = np.dtype(np.uint8)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, index: Any) -> np.ndarray:
+        return self.source.read(self.rows[index])[self.name]
 
 
 @dataclass(frozen=True)
 class Arrays:
-    """A training set in memory. The first axis of all arrays is the sample. Images are uint8, or float32 in [0, 1]."""
+    """A training set. The first axis of all arrays is the sample. Images are uint8, or float32 in [0, 1]."""
 
-    inputs: dict[str, np.ndarray]  # inputs of the model, from first frames
+    inputs: dict[str, Any]  # inputs of the model, from first frames, each a NumPy array or `Shared`
     # Targets of the model, from last frames. A state-space model also needs the state codes `state` of the first
     # frames, pose codes `pose`, and indices `outcome` into the outcomes of the scenario.
-    targets: dict[str, np.ndarray]
+    targets: dict[str, Any]
     # bool (samples,): True if a sample has the input. An input without a mask is present in all samples.
     present: dict[str, np.ndarray] = field(default_factory=dict)
     target_present: dict[str, np.ndarray] = field(default_factory=dict)  # the same for targets, for `mvae` models only
@@ -55,15 +82,30 @@ class Arrays:
 
     def take(self, index: np.ndarray, **further: np.ndarray) -> Batch:
         """The arrays of some samples by field, with `empty`, and with the rows `further` of `views` and `falls`."""
-        batch = jax.tree.map(lambda x: x[index], self._tree()) | {"empty": self.empty}
+        leaves, tree = jax.tree.flatten(self._tree())
+        shared = [leaf for leaf in leaves if isinstance(leaf, Shared)]
+        images = {}
+        for source in {leaf.source for leaf in shared}:  # each frame is read once for all arrays
+            rows = np.unique(np.concatenate([leaf.rows[index] for leaf in shared if leaf.source is source]))
+            images[source] = rows, source.read(rows)
+
+        def taken(leaf: np.ndarray | Shared) -> np.ndarray:
+            if not isinstance(leaf, Shared):
+                return leaf[index]
+            rows, read = images[leaf.source]
+            return read[leaf.name][np.searchsorted(rows, leaf.rows[index])]
+
+        batch: Batch = jax.tree.unflatten(tree, map(taken, leaves)) | {"empty": self.empty}
         return batch | {name: {k: x[rows] for k, x in getattr(self, name).items()} for name, rows in further.items()}
 
     def checksum(self) -> int:
-        """CRC-32 of the names, shapes, types and values of all arrays."""
+        """CRC-32 of the names, shapes, types and values of all arrays, or of the dataset and rows of shared images."""
         value = 0
         further = {"empty": self.empty, "views": self.views, "falls": self.falls}
         for path, x in jax.tree_util.tree_leaves_with_path(self._tree() | further):
             value = zlib.crc32(f"{path}{x.shape}{x.dtype}".encode(), value)
+            if isinstance(x, Shared):
+                value, x = zlib.crc32(f"{x.source.identity} {x.name}".encode(), value), x.rows
             value = zlib.crc32(np.ascontiguousarray(x).data, value)
         return value
 
@@ -80,7 +122,8 @@ def order(seed: int, samples: int, batch_size: int, start: int, stop: int) -> It
     for number in range(start, stop):
         epoch, place = np.divmod(np.arange(number * batch_size, (number + 1) * batch_size), samples)
         permutations = {
-            e: permutations.get(e, np.random.default_rng([seed, e]).permutation(samples)) for e in np.unique(epoch)
+            e: permutations[e] if e in permutations else np.random.default_rng([seed, e]).permutation(samples)
+            for e in np.unique(epoch)
         }
         yield np.array([permutations[e][p] for e, p in zip(epoch, place, strict=True)])
 
@@ -179,7 +222,7 @@ def _arrays(
     measured = {name: ~np.isnan(frames[name]).reshape(*frames[name].shape[:2], -1).any(-1) for name in further}
     present = {name: mask[:, 0] for name, mask in measured.items() if not mask[:, 0].all()}
     if "tactile" in modalities:
-        present["tactile"] = _touched(frames["tactile"], preprocessing, blank)
+        present["tactile"] = _touched(frames["tactile"][:, 0], preprocessing, blank)
     absent = tuple(name for name, mask in present.items() if not mask.any())
     names = (*modalities, *further)
     arrays = Arrays(
@@ -190,6 +233,99 @@ def _arrays(
         condition=condition,
     )
     return arrays, dataclasses.replace(preprocessing, absent=absent)
+
+
+@in_32_bits
+@checked
+def step_arrays(
+    data: Dataset,
+    trajectories: Int[np.ndarray, "n"],
+    modalities: tuple[str, ...],
+    preprocessing: Preprocessing,
+    blank: UInt8[np.ndarray, "h w 3"],
+    *,
+    stride: int = 1,
+    in_memory: bool = True,
+    image_size: int | None = None,
+) -> tuple[Arrays, Preprocessing]:
+    """Make the training arrays of a one-step `mvae` model: inputs from each frame, targets from `stride` frames later.
+
+    If the scenario has a condition, the time since the first frame (s) is its last number. `preprocessing` encodes the
+    condition without this number.
+
+    Args:
+        trajectories: Indices of trajectories with images of all frames, from `evaluation.rows_of` for example.
+        modalities: Modalities of the model, some of `visual`, `tactile` and `pose`.
+        preprocessing: Encodes poses and conditions, and finds the frames with a contact, as for `frame_arrays`.
+        blank: Tactile image of the empty sensor, of the size that the model receives.
+        in_memory: False reads the images of each batch from the dataset's files, which must then remain in place.
+        image_size: Side to which the images are reduced (pixels), see `dataset.reduced`. None: they are not reduced.
+
+    Returns:
+        The arrays, and the preprocessing with new values of `stride`, `period`, `condition_scale` and `absent`.
+    """
+    trajectory, before, after = data.steps(trajectories, stride).T
+    if lacking := set(modalities) - {"visual", "tactile", "pose"}:
+        raise ValueError(f"modalities must be some of visual, tactile and pose, got {lacking.pop()!r}")
+    size = tuple(data.collection["resolution"]) if image_size is None else (image_size, image_size)
+    if not blank.shape[:2] == preprocessing.resolution == size:
+        raise ValueError(
+            f"`blank` has {blank.shape[:2]} pixels and preprocessing.resolution is {preprocessing.resolution}, but the "
+            f"images have {size}: reduce all with `image_size`, `dataset.reduced_images` and resolution={size}"
+        )
+    time, given = data.trajectory["time"], data.trajectory["condition"][trajectory]
+    condition = np.asarray(preprocessing.encode_condition(jnp.asarray(given)))
+    scale = preprocessing.condition_scale
+    if condition.shape[1]:
+        passed = time[trajectory, before] - time[trajectory, 0]
+        condition, scale = np.concatenate([condition, passed[:, None]], axis=1), (*scale, 1.0)
+
+    rows = data.stored(np.stack([trajectory] * 2), np.stack([before, after]))
+    source = _source(data, np.unique(rows), modalities, in_memory, size)
+    inputs: dict[str, Any] = {}
+    targets: dict[str, Any] = {}
+    for group, frames, stored in ((inputs, before, rows[0]), (targets, after, rows[1])):
+        for name in modalities:
+            if name == "pose":
+                group[name] = np.asarray(_pose_codes(preprocessing, data.trajectory["pose"][trajectory, frames]))
+            else:
+                group[name] = Shared(source, name, stored, (len(stored), *size, 3))
+    present = {"tactile": _touched(inputs["tactile"], preprocessing, blank)} if "tactile" in modalities else {}
+    absent = () if all(mask.any() for mask in present.values()) else ("tactile",)
+    arrays = Arrays(
+        inputs={name: x for name, x in inputs.items() if name not in absent},
+        targets=targets,
+        present={name: mask for name, mask in present.items() if name not in absent},
+        condition=condition if condition.shape[1] else None,
+    )
+    period = float(time[0, stride] - time[0, 0])
+    return arrays, dataclasses.replace(
+        preprocessing, stride=stride, period=period, condition_scale=scale, absent=absent
+    )
+
+
+def _source(
+    data: Dataset, rows: np.ndarray, modalities: tuple[str, ...], in_memory: bool, size: tuple[int, ...]
+) -> Source:
+    """The images of the stored frames `rows`, of the given height and width."""
+    names = [name for name in modalities if name != "pose"]
+
+    def read(rows: np.ndarray) -> dict[str, np.ndarray]:
+        images = data.images(rows)
+        found = {name: getattr(images, name) for name in names}
+        return found if size == images.visual.shape[1:3] else reduced_images(found, size[0])
+
+    identity = f"{data.identity} {size}"
+    read(rows[:1])  # an error is raised here, not in the training
+    if not in_memory:
+        return Source(read, identity)
+    whole = {name: np.empty((len(rows), *size, 3), np.uint8) for name in names}
+    for start in range(0, len(rows) if names else 0, _FRAMES):
+        for name, images in read(rows[start : start + _FRAMES]).items():
+            whole[name][start : start + _FRAMES] = images
+    place = np.zeros(len(data.frames), np.int64)
+    place[rows] = np.arange(len(rows))
+    return Source(lambda rows: {name: images[place[rows]] for name, images in whole.items()}, identity)
 
 
 def paper_model(
@@ -236,7 +372,7 @@ def state_arrays(
     last = reduced_images({"visual": pairs.visual[:, 1], "tactile": pairs.tactile[:, 1]}, model.image_size)
     ends = _ends(pairs, code[:, 1], scenario, preprocessing)
     inputs = {"visual": pairs.visual[:, 0], "tactile": pairs.tactile[:, 0], "pose": code[:, 0]}
-    touched = {"tactile": _touched(pairs.tactile, preprocessing, empty["tactile"])} if "tactile" in model.inputs else {}
+    felt = _touched(pairs.tactile[:, 0], preprocessing, empty["tactile"]) if "tactile" in model.inputs else None
     view_arrays, fall_arrays = {}, {}
     if views is not None and len(views.pose) and "visual" in model.inputs:
         state = state_codes(preprocessing, views.pose, views.support, views.mass, views.com)
@@ -247,7 +383,7 @@ def state_arrays(
         inputs={name: np.ascontiguousarray(inputs[name]) for name in model.inputs},
         condition=ends.pop("condition", None),
         targets=last | ends,
-        present=touched,
+        present={} if felt is None else {"tactile": felt},
         empty=empty,
         views=view_arrays,
         falls=fall_arrays,
@@ -324,7 +460,7 @@ def state_model(
     height, width = preprocessing.resolution
     if height != width or preprocessing.crop:
         raise ValueError(f"a state-space model needs resolution=(n, n) and crop=False, got {preprocessing}")
-    absent = () if _touched(pairs.tactile, preprocessing, empty["tactile"]).any() else ("tactile",)
+    absent = () if _touched(pairs.tactile[:, 0], preprocessing, empty["tactile"]).any() else ("tactile",)
     model = statespace.Config(
         inputs=tuple(name for name in statespace.INPUTS if name not in absent),
         outcomes=len(scenario.outcomes),
@@ -340,10 +476,14 @@ def state_model(
     return model, dataclasses.replace(preprocessing, absent=absent)
 
 
-def _touched(tactile: np.ndarray, preprocessing: Preprocessing, blank: np.ndarray) -> np.ndarray:
-    """Whether the first tactile image of each trajectory shows a contact, in parts that bound the memory."""
-    parts = np.array_split(tactile[:, 0], max(len(tactile) // 256, 1))
-    return np.concatenate([np.asarray(_contacts(preprocessing, part, blank)) for part in parts])
+def _touched(tactile: np.ndarray | Shared, preprocessing: Preprocessing, blank: np.ndarray) -> np.ndarray:
+    """Whether each tactile image `(n, height, width, 3)` shows a contact, in parts that bound the memory."""
+    parts, size = [np.zeros(0, bool)], min(_FRAMES, len(tactile))
+    for start in range(0, len(tactile), size or 1):
+        # The last part is filled up with copies of the last image, because another size would compile anew.
+        rows = np.minimum(np.arange(start, start + size), len(tactile) - 1)
+        parts.append(np.asarray(_contacts(preprocessing, tactile[rows], blank)))
+    return np.concatenate(parts)[: len(tactile)]
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -6,6 +6,8 @@
   rounded weights. A prediction reads only the weights, so that another version of optax does not matter
 - `calibration.json`: the calibration of the current checkpoint, for state-space models
 - `metrics.jsonl`: the training log, one record per line: a step, and the means of the loss terms since the last record
+- `best/`: a model folder of its own, with the weights of the checkpoint with the least validation loss. It has no
+  optimiser's state, no log, and no calibration unless `calibrate` is called on it
 - `manifest.json`: the SHA-256 of these files, the step of the current checkpoint, and the log's length at this step
 
 A new checkpoint is written first, then the manifest is replaced, then the older checkpoint is deleted. At any kill, all
@@ -42,6 +44,7 @@ from sts_jax._checked import check_arrays, checked, in_32_bits
 from sts_jax.training.arrays import Arrays, Config, check
 
 CONFIG, BLANK, CALIBRATION, LOG = "config.json", "blank.npz", "calibration.json", "metrics.jsonl"
+BEST = "best"  # folder of the weights with the least validation loss
 WEIGHTS, OPTIMISER = "weights", "optimiser"  # the parts of a checkpoint
 COMPACT = "weights.npz"  # the only file of a compact checkpoint
 KINDS: dict[str, Any] = {"mvae": mvae, "statespace": statespace}  # package of each `kind` in `config.json`
@@ -191,6 +194,20 @@ def save(folder: Path, state: TrainState, *, compact: bool = False) -> None:
         _keep_only(folder, kept)
 
 
+def save_best(folder: Path, state: TrainState) -> None:
+    """Write the weights to the model folder `best` in the folder of a model, with its settings, blank and split."""
+    best, listed = folder / BEST, manifest(folder)
+    if verified(best) == int(state.step):
+        return  # written before a kill
+    for name in (CONFIG, BLANK):
+        if (folder / name).exists() and not (best / name).exists():
+            storage.write_bytes(best / name, (folder / name).read_bytes())
+    if manifest(best) is None:
+        facts = {} if listed is None else {name: fact for name, fact in listed.facts.items() if name == "split"}
+        storage.write_manifest(best, {}, {**facts, "step": None})
+    save(best, state._replace(optimiser=None))
+
+
 def restore(folder: Path, like: TrainState) -> TrainState | None:
     """Read the current checkpoint, if any, after comparing all files with the manifest.
 
@@ -284,6 +301,8 @@ def save_blank(
     folder: Path, visual: UInt8[Array | np.ndarray, "h w 3"], tactile: UInt8[Array | np.ndarray, "h w 3"]
 ) -> None:
     """Write the images of the empty sensor to the folder of a model. An existing file is not changed."""
+    if manifest(folder / BEST) is not None:
+        save_blank(folder / BEST, visual, tactile)
     path, listed = folder / BLANK, manifest(folder)
     new = not path.exists()
     if new:

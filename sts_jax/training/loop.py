@@ -3,10 +3,13 @@
 The loop is a Python loop over one compiled step, because convolutions in `lax.scan` are slow on a CPU.
 """
 
+import collections
+import concurrent.futures
+import dataclasses
 import functools
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -25,8 +28,10 @@ from sts_jax._ranges import check as check_ranges
 from sts_jax.training import folder
 from sts_jax.training.arrays import Arrays, Batch, Config, check, order
 from sts_jax.training.folder import KINDS, Model, Record, TrainState, load
+from sts_jax.training.preprocess import Preprocessing
 
 _DECAY = NOT_NEGATIVE | {"below": 1.0}
+_AHEAD = 2  # number of batches that are read ahead
 Progress = Callable[[int, int, dict[str, float]], None]  # arguments: steps done, steps in total, latest record
 Log = Callable[[int, dict[str, float]], None]  # arguments: step of a record, its other numbers by name
 Terms = dict[str, Array]  # scalars by name: the loss and its parts
@@ -116,6 +121,7 @@ class Learner(NamedTuple):
     init: Callable[[Array], tuple[nnx.GraphDef[Any], nnx.State, nnx.State]]
     loss: Loss
     check: Callable[[Arrays], None]  # raises a ValueError if a training set does not fit the model
+    score: Loss  # the loss with the running batch statistics, for validation
 
 
 def learner(model: Config, *, targets: Literal["all", "own"] = "all", absent: tuple[str, ...] = ()) -> Learner:
@@ -124,19 +130,27 @@ def learner(model: Config, *, targets: Literal["all", "own"] = "all", absent: tu
     package = mvae if isinstance(model, mvae.Config) else statespace
 
     def loss(
-        graphdef: nnx.GraphDef[Any], params: nnx.State, stats: nnx.State, key: PRNGKeyArray, batch: Batch, beta: Array
+        graphdef: nnx.GraphDef[Any],
+        params: nnx.State,
+        stats: nnx.State,
+        key: PRNGKeyArray,
+        batch: Batch,
+        beta: Array,
+        *,
+        training: bool = True,
     ) -> tuple[Array, tuple[nnx.State, Terms]]:
         if package is mvae:
             batch = {name: value for name, value in batch.items() if name != "empty"}
             total, (stats, terms) = mvae.loss(
-                graphdef, params, stats, key, **batch, beta=beta, asked=targets, absent=absent
+                graphdef, params, stats, key, **batch, beta=beta, asked=targets, absent=absent, training=training
             )
             return total, (stats, {"loss": terms.loss, "kl": terms.kl, **terms.reconstruction})
         batch = {name: value for name, value in batch.items() if name != "target_present"}
         total, parts = statespace.loss(graphdef, params, key, **batch, beta=beta)
         return total, (stats, {"loss": total, **parts})
 
-    return Learner(lambda key: package.init(key, model), loss, functools.partial(check, model, absent=absent))
+    suits, score = functools.partial(check, model, absent=absent), functools.partial(loss, training=False)
+    return Learner(lambda key: package.init(key, model), loss, suits, score)
 
 
 @in_32_bits
@@ -170,7 +184,7 @@ def step(
     Returns:
         The new state, and the parts of the loss with the parameters before the step.
     """
-    batch = jax.tree.map(lambda x: x.astype(jnp.float32) / 255 if x.dtype == jnp.uint8 else x, batch)
+    batch = _floats(batch)
     # The second key is unused. Without the split, the noise would differ from that of the published results.
     noise, _ = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), state.step))
     warmup = max(config.beta_warmup * total, 1)
@@ -187,6 +201,12 @@ def step(
     return TrainState(optax.apply_updates(state.params, update), stats, rest, state.step + 1), terms
 
 
+def _floats(batch: Batch) -> Batch:
+    """Convert uint8 images to float32 in [0, 1]."""
+    floats: Batch = jax.tree.map(lambda x: x.astype(jnp.float32) / 255 if x.dtype == jnp.uint8 else x, batch)
+    return floats
+
+
 @in_32_bits
 def train(
     config: TrainConfig,
@@ -194,6 +214,7 @@ def train(
     arrays: Arrays,
     *,
     workdir: str | os.PathLike[str],
+    validation: Arrays | None = None,
     absent: tuple[str, ...] = (),
     targets: Literal["all", "own"] = "all",
     preprocessing: dict[str, Any] | None = None,
@@ -211,12 +232,16 @@ def train(
 
     Args:
         workdir: Folder of the model, see `sts_jax.training.folder` for its files.
+        validation: Samples whose loss is computed at each checkpoint, with beta = 1, running batch statistics and the
+            same noise each time. It is the number `validation` of the log, and the weights with the least one are kept
+            in `workdir/best`, a model folder. Its `views` and `falls` are not used. `calibrate` works on each folder.
         absent: For `mvae` models: names of modalities that are not inputs of any sample, and not in `arrays.inputs`.
         targets: For `mvae` models: modalities to predict from each subset of the inputs, every modality (`all`) or only
             those in the subset (`own`).
         preprocessing: JSON values that describe how images and vectors were made, such as `dataclasses.asdict(p)` of a
             `Preprocessing` p. They are stored in `config.json`.
-        loss: Replaces the loss from `training.learner`. `targets` and `absent` are not passed to it.
+        loss: Replaces the loss from `training.learner`, also for `validation`. `targets` and `absent` are not passed to
+            it.
         optimiser: Replaces the optimiser from `training.optimiser` and its fields of `config`.
         notes: JSON values that name the given loss and optimiser, stored in `config.json`. A resumed training must have
             the same notes, because the functions themselves cannot be compared.
@@ -233,7 +258,7 @@ def train(
     task = learner(model, targets=targets, absent=absent)
     task.check(arrays)
     if loss is not None:
-        task = task._replace(loss=loss)
+        task = task._replace(loss=loss, score=loss)
     settings = {
         "kind": next(name for name, kind in KINDS.items() if isinstance(model, kind.Config)),
         "model": asdict(model),
@@ -243,6 +268,9 @@ def train(
         "data": {"samples": len(arrays), "checksum": arrays.checksum()},
         "preprocessing": preprocessing or {},
     }
+    if validation is not None:
+        _check_validation(model, validation)
+        settings["data"]["validation"] = {"samples": len(validation), "checksum": validation.checksum()}
     for name, function in (("loss", loss), ("optimiser", optimiser)):
         if function is not None:
             settings[name] = f"given as {name}="
@@ -250,18 +278,19 @@ def train(
         settings["notes"] = notes
     settings = json.loads(json.dumps(settings))
     if folder.verified(workdir) == total:  # without a lock, because a lock would write a file
-        storage.claim(workdir / folder.CONFIG, settings)
+        _claim(workdir / folder.CONFIG, settings, model)
         _send(folder.records(workdir), log)
         return load(workdir, calibrated=False)
     with storage.lock(workdir):
-        storage.claim(workdir / folder.CONFIG, settings)
+        _claim(workdir / folder.CONFIG, settings, model)
         optimiser = optimiser or _default_optimiser(config, total)
         graphdef, state = initial(config, task, total, optimiser)
         state = folder.restore(workdir, state) or state
         take = jax.jit(
             lambda state, batch: step(task, graphdef, config, total, state, batch, optimiser), donate_argnums=0
         )
-        state = _run(config, arrays, workdir, state, take, progress, log)
+        score = None if validation is None else _scorer(config, task, graphdef, validation)
+        state = _run(config, arrays, workdir, state, take, score, progress, log)
     return Model(model, graphdef, nnx.merge_state(state.params, state.stats), int(state.step), settings)
 
 
@@ -271,6 +300,7 @@ def _run(
     workdir: Path,
     state: TrainState,
     take: Callable[[TrainState, Batch], tuple[TrainState, Terms]],
+    score: Callable[[TrainState], float] | None,
     progress: Progress | None,
     log: Log | None,
 ) -> TrainState:
@@ -279,15 +309,17 @@ def _run(
     kept = folder.resume_log(workdir)
     _send(kept, log)
     record = kept[-1] if kept else {}
+    least = min((each["validation"] for each in kept if "validation" in each), default=np.inf)
     recent: list[Terms] = []
     batches = _batches(config, arrays, start, total)
-    batch = next(batches, {})
     for done in range(start + 1, total + 1):
-        state, terms = take(state, batch)
-        batch = next(batches, {})  # while the device computes the step
+        state, terms = take(state, next(batches))
         recent.append(jax.block_until_ready(terms))
+        at_checkpoint = done % config.checkpoint_every == 0 or done == total
         if done % config.log_every == 0 or done == total:
             record = {"step": done, **jax.tree.map(lambda *x: float(np.mean(x)), *recent)}
+            if score is not None and at_checkpoint:
+                record["validation"] = score(state)
             recent = []
             folder.append(workdir, record)
             _send([record], log)
@@ -296,7 +328,15 @@ def _run(
                     f"{workdir}: the loss is {record['loss']} at step {done}: lower TrainConfig.learning_rate (now "
                     f"{config.learning_rate}) or TrainConfig.clip (now {config.clip}), or change your own optimiser."
                 )
-        if done % config.checkpoint_every == 0 or done == total:
+            if not np.isfinite(record.get("validation", 0.0)):
+                raise FloatingPointError(
+                    f"{workdir}: the validation loss is {record['validation']} at step {done}: mask values of "
+                    "`validation` that are not finite with its field `present`, or lower TrainConfig.learning_rate."
+                )
+        if at_checkpoint:
+            if record.get("validation", np.inf) < least:
+                least = record["validation"]
+                folder.save_best(workdir, state)  # before the checkpoint, so that a resumed training finds it
             folder.save(workdir, state)
         if progress is not None:
             progress(done, total, record)
@@ -309,8 +349,61 @@ def _batches(config: TrainConfig, arrays: Arrays, start: int, total: int) -> Ite
         for name, values, size in (("views", arrays.views, config.views), ("falls", arrays.falls, config.falls))
         if values and size
     }
-    for index in order(config.seed, len(arrays), config.batch_size, start, total):
-        yield arrays.take(index, **{name: next(rows) for name, rows in further.items()})
+    rows = zip(order(config.seed, len(arrays), config.batch_size, start, total), *further.values(), strict=True)
+    return _read_ahead(arrays, ((first, dict(zip(further, more, strict=True))) for first, *more in rows))
+
+
+def _read_ahead(arrays: Arrays, chosen: Iterable[tuple[np.ndarray, dict[str, np.ndarray]]]) -> Iterator[Batch]:
+    """Take batches in a thread, while the device computes. `chosen` has the arguments of `Arrays.take`."""
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        waiting: collections.deque[concurrent.futures.Future[Batch]] = collections.deque()
+        for index, further in chosen:
+            waiting.append(pool.submit(arrays.take, index, **further))
+            if len(waiting) > _AHEAD:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+
+
+def _scorer(
+    config: TrainConfig, task: Learner, graphdef: nnx.GraphDef[Any], validation: Arrays
+) -> Callable[[TrainState], float]:
+    """A function that computes the validation loss of a state."""
+    starts = range(0, len(validation), config.batch_size)
+    rows = [np.arange(start, min(start + config.batch_size, len(validation))) for start in starts]
+
+    @jax.jit
+    def loss(params: nnx.State, stats: nnx.State, key: PRNGKeyArray, batch: Batch) -> Array:
+        return task.score(graphdef, params, stats, key, _floats(batch), jnp.ones(()))[0]
+
+    def score(state: TrainState) -> float:
+        keys = jax.random.split(jax.random.key(config.seed), len(rows))
+        batches = _read_ahead(validation, ((index, {}) for index in rows))
+        values = [float(loss(state.params, state.stats, *both)) for both in zip(keys, batches, strict=True)]
+        return float(np.average(values, weights=[len(index) for index in rows]))
+
+    return score
+
+
+def _claim(path: Path, settings: dict[str, Any], model: Config) -> None:
+    """Record or compare the settings of a training. Fields that an older version lacked must have their defaults."""
+    recorded = storage.read_json(path, f"delete {path.parent}, or choose another folder") if path.exists() else None
+    settings = dict(settings)
+    for group, kind in (("model", type(model)), ("training", TrainConfig), ("preprocessing", Preprocessing)):
+        if isinstance(recorded, dict) and isinstance(known := recorded.get(group), dict):
+            new = {field.name: field.default for field in dataclasses.fields(kind) if field.name not in known}
+            values = settings[group].items()
+            settings[group] = {name: value for name, value in values if name not in new or value != new[name]}
+    storage.claim(path, settings)
+
+
+def _check_validation(model: Config, validation: Arrays) -> None:
+    """Raise a ValueError if a validation set does not fit a model. It may lack an input, such as the first touch."""
+    names = model.names if isinstance(model, mvae.Config) else ()
+    try:
+        check(model, validation, tuple(name for name in names if name not in validation.inputs))
+    except ValueError as error:
+        raise ValueError(f"`validation` does not fit the model: {error}") from None
 
 
 def _send(some: list[Record], log: Log | None) -> None:

@@ -39,12 +39,21 @@ class Preprocessing:
     condition_scale: tuple[float, ...] = ()  # SI units, divisors of the numbers of the scenario's condition
     # (name, scale) of each further modality that is a vector (`dataset.Measurement`), scale in SI units
     scales: tuple[tuple[str, float], ...] = ()
+    # number of frames from the input to the target of a one-step model (None: the target is the last frame)
+    stride: int | None = None
+    period: float = 0.0  # s, time from the input to the target of a one-step model
 
     def __post_init__(self) -> None:
         if self.rotation not in ("matrix", "quaternion"):
             raise ValueError(f"rotation must be 'matrix' or 'quaternion', got {self.rotation!r}")
         if self.touch_block < 1 or any(side % self.touch_block for side in self.resolution):
             raise ValueError(f"touch_block must divide resolution {self.resolution}, got {self.touch_block}")
+        valid = self.period == 0 if self.stride is None else self.stride >= 1 and 0 < self.period < np.inf
+        if not valid:
+            raise ValueError(
+                f"stride={self.stride} and period={self.period}: give a stride >= 1 with a period > 0 (s) for a "
+                "one-step model, or neither"
+            )
 
     @property
     def pose_size(self) -> int:
@@ -77,6 +86,11 @@ class Preprocessing:
 
     def encode_condition(self, condition: Float[Array, "*n c"]) -> Float[Array, "*n c"]:
         """Divide conditions (SI units) by their typical sizes `condition_scale`."""
+        if condition.shape[-1] != len(self.condition_scale):
+            raise ValueError(
+                f"the condition has {condition.shape[-1]} numbers, but condition_scale={self.condition_scale} has "
+                f"{len(self.condition_scale)}: make the preprocessing with scenario.condition_scale"
+            )
         return condition / jnp.array(self.condition_scale, jnp.float32)
 
     def encode(self, name: str, values: Float[Array, "..."]) -> Float[Array, "..."]:
