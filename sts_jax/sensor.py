@@ -82,7 +82,7 @@ class Sensor:
             return jnp.where(sound, value, default)
 
         leaves, structure = jax.tree.flatten(self)
-        defaults = jax.tree.leaves(_default(self))
+        defaults = jax.tree.leaves(_default_of(self))
         return jax.tree.unflatten(structure, [safe(*pair) for pair in zip(leaves, defaults, strict=True)]), sound
 
     def constants(self) -> dict[str, Any]:
@@ -170,14 +170,20 @@ def _require(conditions: Iterator[_Condition]) -> None:
             raise ValueError(message())
 
 
-def _default(sensor: Sensor) -> Sensor:
-    """The default sensor with the same kind of lights."""
-    return dataclasses.replace(type(sensor)(), lights=Leds() if isinstance(sensor.lights, Leds) else Lights())
+@functools.cache  # making its arrays takes a quarter of the time of a small image
+def _default(kind: type[Sensor], lights: type[Lights | Leds]) -> Sensor:
+    """The default sensor with one kind of lights. Its arrays are not traced."""
+    with jax.ensure_compile_time_eval():
+        return dataclasses.replace(kind(), lights=lights())
+
+
+def _default_of(sensor: Sensor) -> Sensor:
+    return _default(type(sensor), Leds if isinstance(sensor.lights, Leds) else Lights)
 
 
 def _conditions(sensor: Sensor) -> Iterator[_Condition]:
     """Yield all conditions on a sensor. The flag of a condition on traced values is traced."""
-    yield from _field_conditions(_default(sensor), sensor, "")
+    yield from _field_conditions(_default_of(sensor), sensor, "")
     distance, near = _array(sensor.camera.distance), _array(sensor.camera.near)
     thickness, max_depth = _array(sensor.gel.thickness), _array(sensor.gel.max_depth)
     yield (
