@@ -94,6 +94,17 @@ def predictor(size: int) -> Callable[[], None]:
     return lambda: jax.block_until_ready(run(state, x)) and None
 
 
+def roller(steps: int) -> Callable[[], None]:
+    """Make a function that rolls out `MODEL` from a visual image."""
+    graphdef, params, stats = mvae.init(jax.random.key(0), MODEL)
+    view, blank = training.Preprocessing(stride=1, period=0.032), np.full((64, 64, 3), 128, np.uint8)
+    model = training.Model(MODEL, graphdef, nnx.merge_state(params, stats), 0, {})
+    predict = sts.Predictor(model, view, (blank, blank), "random weights")
+    image = np.full(blank.shape, 0.5, np.float32)
+    image[20:40, 15:45] = 0.2
+    return lambda: jax.block_until_ready(predict.rollout({"visual": image}, steps)) and None
+
+
 def state_stepper(size: int) -> Callable[[], None]:
     """Make a function that runs one training step of a state-space model on random data."""
     rng, model = np.random.default_rng(0), statespace.Config()
@@ -146,6 +157,8 @@ def paper() -> None:
         show(f"training step, batch {size}", paper_stepper(MODEL, size, ("tactile",)), 5)
     show("training step, visual only, batch 64", paper_stepper(VISUAL, 64, ()), 5)
     show("prediction, batch 1", predictor(1), 50)
+    steps = 32
+    print(f"roll-out, batch 1, per frame: {1e3 * median_seconds(roller(steps), repeats=11)[0] / steps:.1f} ms")
 
 
 def show(name: str, call: Callable[[], None], repeats: int) -> None:

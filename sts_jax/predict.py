@@ -1,4 +1,4 @@
-"""`Predictor`: a trained model as a function that predicts the last frame of a trajectory from the first frame."""
+"""`Predictor`: a trained model as a function that predicts the last frame of a trajectory, or frame after frame."""
 
 import dataclasses
 import functools
@@ -6,7 +6,7 @@ import importlib.resources
 import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ from sts_jax import mvae, statespace, storage, training
 from sts_jax._checked import checked, in_32_bits, warn
 from sts_jax._devices import on_each_device
 from sts_jax._plausible import image_problem, order_problem, pair_problem, pose_problem
-from sts_jax.prediction import Prediction, completed, flagged, predict, predict_samples
+from sts_jax.prediction import Prediction, completed, flagged, predict, predict_samples, rollout
 
 STREAMS = ("visual", "tactile")
 MODALITIES = (*STREAMS, "pose")
@@ -37,13 +37,22 @@ Numbers = Num[Array | np.ndarray, "*n c"]
 Kind = Literal["image", "pose", "vector"]  # each kind of inputs has its own range
 
 
+class _Course(NamedTuple):
+    """The arguments that only a roll-out has."""
+
+    steps: int
+    last: bool  # return the last step only
+    time: Any  # s, time of the first frame: a number, or (*n,)
+
+
 class Predictor:
     """A trained model as a function: `predictor(visual=image)` returns a `Prediction`.
 
-    The prediction is the last frame, in which the object has come to rest. `Predictor.load("freefall")` loads a model
-    that comes with the library, and `Predictor.load("runs/freefall")` one that you trained. Calls are
-    pure, work inside `jax.jit`, `jax.vmap` and `jax.grad`, and may run in several threads. The prediction of an item
-    does not depend on the other items of its batch. Outside `jax.jit`, the memory does not grow with the batch.
+    The prediction is the last frame, in which the object has come to rest. A one-step model predicts frame after frame:
+    `predictor.rollout(frame, steps)`. `Predictor.load("freefall")` loads a model that comes with the library, and
+    `Predictor.load("runs/freefall")` one that you trained. Calls are pure, work inside `jax.jit`, `jax.vmap` and
+    `jax.grad`, and may run in several threads. The prediction of an item does not depend on the other items of its
+    batch. Outside `jax.jit`, the memory does not grow with the batch.
     """
 
     def __init__(
@@ -181,7 +190,83 @@ class Predictor:
                 equal samples. With a key for each item, such as `jax.random.split(key, n)`, their samples differ.
             num_samples: Number of predictions to draw for each item, returned in `Prediction.samples`.
         """
+        self._check_kind(rolled=False)
         every = {"visual": visual, "tactile": tactile, "pose": pose, "state": state, **(measurements or {})}
+        return self._answer(every, present or {}, condition, key, num_samples)
+
+    @in_32_bits
+    @checked
+    def rollout(
+        self,
+        frame: Any,
+        steps: int,
+        *,
+        condition: Numbers | None = None,
+        time: Num[ArrayLike, "..."] = 0.0,
+        key: Key[Array, "..."] | None = None,
+        num_samples: int = 0,
+        last: bool = False,
+    ) -> Prediction:
+        """Predict frame after frame with a one-step model, each frame from the predicted frame before.
+
+        Without a key, each step decodes the mean of the posterior of the latent. With a key, each step draws the
+        latent, and the result is one sampled course. With `num_samples`, the result is the course of the means, and its
+        `samples` are sampled courses. From the second step on, all modalities that the model predicts are its inputs,
+        even if the first frame lacks some. A predicted tactile image without contact is ignored like a given one.
+
+        Args:
+            frame: First frame: a `Frame`, a `Prediction` of one frame, or a mapping with some of `visual`, `tactile`
+                and `pose`. Arrays and checks are those of a call.
+            steps: Number of steps, at least 1. A step takes `preprocessing.period` (s), which are `stride` frames.
+            condition: Conditions as in a call. The time is added to them.
+            time: Time of the first frame since frame 0 of its trajectory (s), for models with a condition.
+            key: Random key for one course, or for the samples if `num_samples` > 0. One, or one for each item.
+            num_samples: Number of sampled courses.
+            last: True to return the last step only, with an axis of time of length 1. It saves memory.
+
+        Returns:
+            The predictions of all steps, with an axis of time: `visual` (*n, steps, h, w, 3), `pose` (*n, steps, 7).
+            `samples` have a further first axis. Its `mean` and `log_var` are those of the course of the means.
+        """
+        self._check_kind(rolled=True)
+        if steps < 1:
+            raise ValueError(f"steps must be >= 1, got {steps}")
+        if isinstance(frame, Mapping):
+            every = dict(frame)
+        elif all(hasattr(frame, name) for name in MODALITIES):
+            values = {name: getattr(frame, name) for name in MODALITIES}
+            values |= getattr(frame, "measurements", None) or {}
+            every = {name: value for name, value in values.items() if name in self.modalities}
+        else:
+            raise TypeError(
+                f"`frame` is a {type(frame).__name__}: give a Frame, a Prediction, or a mapping with some of "
+                f"{', '.join(self.modalities)}."
+            )
+        return self._answer(every, {}, condition, key, num_samples, _Course(steps, last, time))
+
+    def _check_kind(self, *, rolled: bool) -> None:
+        """Raise a ValueError if a one-step model is called, or if a model of the last frame is rolled out."""
+        if rolled and self.stride is None:
+            raise ValueError(
+                f"{self.name} predicts the last frame, and has no steps: call it, or train a one-step model with "
+                "training.step_arrays."
+            )
+        if not rolled and self.stride is not None:
+            raise ValueError(
+                f"{self.name} is a one-step model: it predicts the frame {self.preprocessing.period:g} s later, not "
+                "the last one. Use rollout(frame, steps)."
+            )
+
+    def _answer(
+        self,
+        every: dict[str, Any],
+        present: Mapping[str, Any],
+        condition: Any,
+        key: Any,
+        num_samples: int,
+        course: _Course | None = None,
+    ) -> Prediction:
+        """Check the arguments of a call or of a roll-out, and predict."""
         inputs = {name: self._input(name, value) for name, value in every.items() if value is not None}
         if not inputs:
             raise ValueError(f"nothing to predict from: give at least one of {', '.join(self.modalities)}.")
@@ -196,7 +281,7 @@ class Predictor:
             raise ValueError(f"num_samples={num_samples} and key={key}: give num_samples >= 0, and a key if it is > 0.")
         if key is not None and key.shape not in ((), lead):
             raise ValueError(f"key has shape {key.shape}: give one key, or keys of shape {lead}, one for each item.")
-        masks = {name: _array(mask) for name, mask in (present or {}).items()}
+        masks = {name: _array(mask) for name, mask in present.items()}
         for name, mask in masks.items():
             if name not in inputs or mask.shape != lead or mask.dtype != bool:
                 raise ValueError(
@@ -210,7 +295,7 @@ class Predictor:
                 valid.append(fine | ignored)
             elif not np.all(fine | ignored):
                 raise ValueError(_reason(name, self._kinds[name], np.asarray(array)[~(fine | ignored)]))
-        predicted = self._predicted(inputs, masks, lead, condition, valid, key, num_samples)
+        predicted = self._predicted(inputs, masks, lead, condition, valid, key, num_samples, course)
         # JAX computes the prediction meanwhile.
         for problem in dict.fromkeys(filter(None, self._problems(inputs, masks, lead))):
             warn(problem)
@@ -220,6 +305,7 @@ class Predictor:
     @checked
     def prior(self, shape: tuple[int, ...] = (), *, condition: Numbers | None = None) -> Prediction:
         """Predict last frames from the model's prior distribution, for leading axes `shape`. Condition as in a call."""
+        self._check_kind(rolled=False)
         return self._predicted({}, {}, shape, condition, [], None, 0)
 
     def _predicted(
@@ -231,8 +317,9 @@ class Predictor:
         valid: list[Array],
         key: Array | None,
         num_samples: int,
+        course: _Course | None = None,
     ) -> Prediction:
-        condition, fine = self._condition(condition, lead)
+        condition, fine = self._condition(condition, lead, course)
         given = inputs, present, condition, key if key is not None and key.ndim else None
 
         def run(given: tuple, lead: tuple[int, ...]) -> Prediction:
@@ -240,8 +327,10 @@ class Predictor:
             model, view = self.model, self.preprocessing
             graphdef, state, shared = model.graphdef, model.state, (condition, key if keys is None else keys)
             if isinstance(model.config, mvae.Config):
-                blank = self._empty["tactile"]
-                return predict(graphdef, state, view, blank, inputs, present, *shared, num_samples, lead)
+                arguments = graphdef, state, view, self._empty["tactile"], inputs, present, *shared, num_samples, lead
+                if course is not None:
+                    return rollout(*arguments, steps=course.steps, last=course.last)
+                return predict(*arguments)
             inputs, present = completed(self._inputs, view.resolution, inputs, present, lead)
             more = *shared, num_samples, lead, model.calibration
             return predict_samples(graphdef, state, view, self._empty, inputs, present, *more)
@@ -256,7 +345,12 @@ class Predictor:
             flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(lead) :]), given)
             result = _joined([run(part, (chunk,)) for part in _cut(flat, chunk, count)], lead)
         valid = valid if fine is None else [*valid, fine]
-        return flagged(result, jnp.all(jnp.stack(valid), axis=0)) if valid else result
+        return flagged(result, jnp.all(jnp.stack(valid), axis=0), time=int(course is not None)) if valid else result
+
+    @property
+    def stride(self) -> int | None:
+        """Number of frames that one step of the model takes, or None if it predicts the last frame."""
+        return self.preprocessing.stride
 
     @property
     def modalities(self) -> tuple[str, ...]:
@@ -322,10 +416,13 @@ class Predictor:
         return _float32(array)
 
     def _condition(
-        self, condition: Any, lead: tuple[int, ...]
+        self, condition: Any, lead: tuple[int, ...], course: _Course | None
     ) -> tuple[np.ndarray | Array | None, Bool[Array, "*n"] | None]:
-        """Check the condition. Return it as float32 and, if it is traced, a mask of the items in range."""
-        width = self.model.config.condition
+        """Check the condition. Return it as float32 and, if it is traced, a mask of the items in range.
+
+        In a roll-out, the time of the first frame is its last number.
+        """
+        width = max(self.model.config.condition - (course is not None), 0)
         shape, needed = None if condition is None else condition.shape, (*lead, width) if width else None
         if shape != needed:
             raise ValueError(
@@ -335,15 +432,22 @@ class Predictor:
         if condition is None:
             return None, None
         condition = _float32(_array(condition))
+        if course is not None:
+            time = _float32(_array(course.time))
+            if time.shape not in ((), lead):
+                raise ValueError(f"time has shape {time.shape}: give one number, or one for each item, {lead}.")
+            xp = jnp if _traced(condition) or _traced(time) else np
+            condition = xp.concatenate([condition, xp.broadcast_to(time, lead)[..., None]], -1)
         limit = _LARGEST_CONDITION * np.array(self.preprocessing.condition_scale)
         fine = (abs(condition) <= limit).all(axis=-1)
         if _traced(fine):
             return condition, fine
         if not fine.all():
+            sizes = np.abs(condition).reshape(-1, len(limit)).max(0).tolist()
             raise ValueError(
-                f"condition has magnitudes up to {np.abs(condition).reshape(-1, width).max(0).tolist()}, but the "
-                f"limits are {limit.tolist()} ({_LARGEST_CONDITION:g} times the typical magnitudes): give finite "
-                "numbers in SI units."
+                f"condition{' and time have' if course else ' has'} magnitudes up to {sizes}, but the limits are "
+                f"{limit.tolist()} ({_LARGEST_CONDITION:g} times the typical magnitudes): give finite numbers in SI "
+                "units."
             )
         return condition, None
 

@@ -20,7 +20,10 @@ _CLOSE = 1e-6  # m, distance below which the weight of a sample in Weiszfeld's m
 
 
 class Prediction(NamedTuple):
-    """Prediction of the last frame. Modalities that the model does not predict are None."""
+    """Prediction of the last frame. Modalities that the model does not predict are None.
+
+    A roll-out has the axis of time behind the leading axes *n, one index for each step.
+    """
 
     visual: Float[Array, "*n h w 3"] | None  # visual image, sRGB in [0, 1]
     tactile: Float[Array, "*n h w 3"] | None  # tactile image in [0, 1]
@@ -83,14 +86,7 @@ def predict(
         out = mvae.decode(graphdef, state, z, condition=wide)
         out = {name: value.reshape(*shape, *value.shape[z.ndim - 1 :]) for name, value in out.items()}
         values = {name: preprocessing.decode(name, value) for name, value in out.items()}
-        return Prediction(
-            visual=values.pop("visual", None),
-            tactile=values.pop("tactile", None),
-            pose=values.pop("pose", None),
-            mean=posterior.mean.reshape(*lead, -1),
-            log_var=posterior.log_var.reshape(*lead, -1),
-            measurements=values or None,
-        )
+        return _named(values, *(x.reshape(*lead, -1) for x in posterior))
 
     result = decode(posterior.mean, lead)
     if num_samples and key is not None:
@@ -99,6 +95,101 @@ def predict(
         noise = jax.vmap(lambda key: jax.random.normal(key, (num_samples, latent)), out_axes=1)(keys)
         z = posterior.mean[None] + jnp.exp(0.5 * posterior.log_var)[None] * noise
         result = result._replace(samples=decode(z, (num_samples, *lead)))
+    return result
+
+
+def _named(values: dict[str, Array], mean: Array, log_var: Array) -> Prediction:
+    """A prediction from decoded values by the name of the modality."""
+    further = dict(values)
+    return Prediction(
+        visual=further.pop("visual", None),
+        tactile=further.pop("tactile", None),
+        pose=further.pop("pose", None),
+        mean=mean,
+        log_var=log_var,
+        measurements=further or None,
+    )
+
+
+class _Frame(NamedTuple):
+    """State of a roll-out: the frame of each course of each item, (rows, ...)."""
+
+    values: dict[str, Array]  # by modality: images in [0, 1], poses (rows, 7), further modalities
+    present: dict[str, Bool[Array, "rows"]]  # masks of the values that are inputs of the next step
+    posterior: mvae.Gaussian  # of the latent from which the frame was predicted
+
+
+@functools.partial(jax.jit, static_argnames=("graphdef", "preprocessing", "num_samples", "lead", "steps", "last"))
+def rollout(
+    graphdef: nnx.GraphDef,
+    state: nnx.State,
+    preprocessing: training.Preprocessing,
+    blank: Float[Array, "h w 3"],
+    inputs: dict[str, Float[Array, "..."]],
+    present: dict[str, Bool[Array, "*n"]],
+    condition: Float[Array, "..."] | None = None,
+    key: Key[Array, "..."] | None = None,
+    num_samples: int = 0,
+    lead: tuple[int, ...] = (),
+    *,
+    steps: int,
+    last: bool = False,
+) -> Prediction:
+    """Apply a one-step multimodal variational autoencoder to its own predictions, see `Predictor.rollout`.
+
+    Args:
+        condition: Conditions in SI units, of which the last number is the time of the first frame (s), or None.
+        key: Random key, one for all items or one for each. None for the course of the means.
+        num_samples: Number of sampled courses. If it is 0 and there is a key, the one course is sampled.
+        last: True to return the last step only, with an axis of time of length 1.
+
+    The other arguments are those of `predict`.
+    """
+    config, items = nnx.merge(graphdef, state).config, math.prod(lead)
+    courses = 1 + num_samples  # that of the means first, unless the only course is sampled
+    keys = None if key is None else jnp.broadcast_to(key.reshape(-1), items)
+
+    def rows(x: Array) -> Array:
+        """The values of all items, (*lead, ...), for each course."""
+        return jnp.tile(x.reshape(items, *x.shape[len(lead) :]), (courses, *(1,) * (x.ndim - len(lead))))
+
+    def noise(step: Int[Array, ""]) -> Float[Array, "rows latent"]:
+        if keys is None:
+            return jnp.zeros((courses * items, config.latent))
+        shape = max(num_samples, 1), config.latent
+        drawn = jax.vmap(lambda key: jax.random.normal(jax.random.fold_in(key, step), shape), out_axes=1)(keys)
+        return jnp.concatenate([jnp.zeros((courses - len(drawn), *drawn.shape[1:])), drawn]).reshape(-1, config.latent)
+
+    def advance(frame: _Frame, step: Int[Array, ""]) -> tuple[_Frame, _Frame | None]:
+        flat, counts = _flat(preprocessing, frame.values, frame.present, (courses * items,), blank)
+        posterior = mvae.infer(graphdef, state, flat, present=counts)
+        z = posterior.mean + jnp.exp(0.5 * posterior.log_var) * noise(step)
+        now = None
+        if begin is not None:
+            now = preprocessing.encode_condition(begin.at[:, -1].add(step * preprocessing.period))
+        out = mvae.decode(graphdef, state, z, condition=now)
+        values = {name: preprocessing.decode(name, value) for name, value in out.items()}
+        known = {name: jnp.full(courses * items, name not in preprocessing.absent) for name in values}
+        new = _Frame(values, known, posterior)
+        return new, None if last else new
+
+    begin = None if condition is None else rows(condition)
+    nothing = {m.name: preprocessing.decode(m.name, jnp.zeros((*lead, *m.shape))) for m in config.modalities}
+    absent = {name: jnp.full(lead, name in inputs) for name in config.names}
+    unknown = mvae.Gaussian(*jnp.zeros((2, courses * items, config.latent)))
+    start = _Frame(jax.tree.map(rows, nothing | inputs), jax.tree.map(rows, absent | present), unknown)
+    end, frames = jax.lax.scan(advance, start, jnp.arange(steps))
+    if frames is None:
+        frames = jax.tree.map(lambda x: x[None], end)
+    # (time, rows, ...) -> (courses, *lead, time, ...)
+    values, posterior = jax.tree.map(
+        lambda x: jnp.moveaxis(x, 0, 1).reshape(courses, *lead, len(x), *x.shape[2:]), (frames.values, frames.posterior)
+    )
+    every = _named(values, *posterior)
+    result: Prediction = jax.tree.map(lambda x: x[0], every)
+    if num_samples:
+        samples = jax.tree.map(lambda x: x[1:], every)
+        result = result._replace(samples=samples._replace(mean=result.mean, log_var=result.log_var))
     return result
 
 
@@ -211,8 +302,11 @@ def _flat(
     return flat, counts
 
 
-def flagged(prediction: Prediction, valid: Bool[Array, "*n"], *, leading: int = 0) -> Prediction:
-    """Set the items of a prediction that are not valid to NaN. Samples have `leading` axes before those of `valid`."""
+def flagged(prediction: Prediction, valid: Bool[Array, "*n"], *, leading: int = 0, time: int = 0) -> Prediction:
+    """Set the items of a prediction that are not valid to NaN.
+
+    Samples have `leading` axes before those of `valid`, and roll-outs have `time` axes behind them.
+    """
 
     def flag(leaf: Array, axes: int) -> Array:
         return jnp.where(valid.reshape(*valid.shape, *(1,) * axes), leaf, jnp.nan)
@@ -220,9 +314,9 @@ def flagged(prediction: Prediction, valid: Bool[Array, "*n"], *, leading: int = 
     values: dict[str, Any] = prediction._asdict()
     samples, measurements = values.pop("samples"), values.pop("measurements")
     for name, leaf in values.items():
-        values[name] = None if leaf is None else flag(leaf, 3 if name in statespace.IMAGES else 1)
+        values[name] = None if leaf is None else flag(leaf, time + (3 if name in statespace.IMAGES else 1))
     return Prediction(
         **values,
-        samples=None if samples is None else flagged(samples, valid, leading=1),
+        samples=None if samples is None else flagged(samples, valid, leading=1, time=time),
         measurements=jax.tree.map(lambda leaf: flag(leaf, leaf.ndim - valid.ndim - leading), measurements),
     )

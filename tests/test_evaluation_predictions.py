@@ -102,6 +102,69 @@ def test_the_outcome_of_a_model_without_a_pose_depends_on_its_image():
     assert outcome(physics.Perturbed(), validation=validation, blank=blank) is None  # more than two outcomes
 
 
+class Riser:
+    """A one-step model of two frames and 0.1 s, whose object rises by 1 cm in each step. It records its calls."""
+
+    preprocessing = training.Preprocessing(stride=2, period=0.1)
+
+    def __init__(self):
+        self.calls = []
+
+    def rollout(self, frame, steps, *, condition=None, time=0.0, key=None, num_samples=0, last=False):
+        self.calls.append({"given": set(frame), "time": time, "steps": steps})
+        rise = np.arange(1, steps + 1)[steps - 1 if last else 0 :, None] * np.eye(7)[2] / 100
+        pose = frame["pose"][:, None] + rise
+        visual = np.broadcast_to(frame["visual"][:, None], (*pose.shape[:2], *frame["visual"].shape[1:]))
+        drawn = np.stack([pose + k * np.eye(7)[2] for k in range(num_samples)]) if num_samples else None
+        samples = None if drawn is None else answer(0, np.repeat(visual[None], num_samples, 0), drawn)
+        return answer(len(pose), visual, pose, samples)
+
+
+def later(count, first=0, second=6):
+    test = pairs(np.arange(count), np.zeros((count, 0)))
+    return test._replace(frame=np.broadcast_to([first, second], (count, 2)))
+
+
+@pytest.mark.parametrize("num_samples", [0, 2])
+def test_a_one_step_model_is_rolled_out_to_the_second_frames(num_samples):
+    model, test = Riser(), later(100, 4, 10)
+    test.pose[:, 0, 2] = np.linspace(-0.1, 0.1, 100)
+    known = {"num_samples": num_samples}
+    found = evaluation.predict(model, ("visual", "pose"), test, physics.Freefall(), **known)
+    np.testing.assert_allclose(found.pose[:, 2], test.pose[:, 0, 2] + 0.03, atol=1e-6)
+    assert found.visual.shape == (100, 4, 4, 3)
+    np.testing.assert_array_equal(found.outcome, np.where(found.pose[:, 2] < -0.005, FELL, RESTS))
+    assert [call["steps"] for call in model.calls] == [3, 3]
+    np.testing.assert_allclose(model.calls[0]["time"], 0.2)  # frame 4, with 0.05 s per frame
+    every = evaluation.rollout(model, ("visual", "pose"), test, physics.Freefall(), steps=3, **known)
+    assert [float(frame.pose[0, 2]) for frame in every] == pytest.approx([-0.09, -0.08, -0.07], abs=1e-6)
+    jax.tree.map(np.testing.assert_array_equal, every[-1], found)
+    if num_samples:
+        assert found.samples.visual.dtype == np.uint8
+        assert found.samples.pose.shape == (2, 100, 7)
+        np.testing.assert_allclose(every[0].samples.pose[1, :, 2], test.pose[:, 0, 2] + 1.01, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("frames", "message"),
+    [
+        (None, "the pairs have no `frame`, which a one-step model needs"),
+        ([[0, 6], [0, 8]], r"are 6, 8 frames apart, but a step of the model takes 2: .* frames=\(t, t \+ k \* 2\)\)"),
+        ([[0, 5], [1, 6]], "are 5 frames apart, but a step of the model takes 2"),
+        ([[6, 0], [6, 0]], "are -6 frames apart"),
+    ],
+)
+def test_frames_that_no_number_of_steps_connects_are_refused(frames, message):
+    test = later(2)._replace(frame=None if frames is None else np.array(frames))
+    with pytest.raises(ValueError, match=message):
+        evaluation.predict(Riser(), ("visual", "pose"), test, physics.Freefall())
+
+
+def test_a_model_of_the_last_frame_is_not_rolled_out():
+    with pytest.raises(ValueError, match=r"predicts the last frame, and has no steps: use evaluation\.predict"):
+        evaluation.rollout(Echo(), ("visual",), later(2), physics.Freefall(), steps=2)
+
+
 TIMES, SIDE = 3, 4
 COLLECTION = dataset.Collection(physics.Freefall(), num_objects=2, num_per_object=2, resolution=(2 * SIDE, 2 * SIDE))
 OFF_FIRST = np.array([0.0, 1.0, -1.0])  # m, added to z in the re-rolls of an item

@@ -19,6 +19,7 @@ from sts_jax.evaluation.predictions import frequency as frequency
 from sts_jax.evaluation.predictions import joined as joined
 from sts_jax.evaluation.predictions import outcome_of_pose as outcome_of_pose
 from sts_jax.evaluation.predictions import predict as predict
+from sts_jax.evaluation.predictions import rollout as rollout
 from sts_jax.evaluation.predictions import rows_of as rows_of
 from sts_jax.evaluation.predictions import shares as shares
 from sts_jax.evaluation.predictions import subsets as subsets

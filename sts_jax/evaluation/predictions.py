@@ -1,4 +1,4 @@
-"""Predictions of the last frames of held-out trajectories, from any subset of a model's inputs."""
+"""Predictions of frames of held-out trajectories, from any subset of a model's inputs."""
 
 import enum
 import functools
@@ -19,10 +19,11 @@ from sts_jax.evaluation.metrics import best_threshold
 TRUE_STATE = "visual and the true state"  # the true state: pose, shape and mass of the object, from the simulation
 _FELL_OFF = int(physics.Outcome.FELL_OFF)
 _CHUNK = 64  # number of trajectories that one call predicts
+_FRAMES = 4096  # largest number of frames that one call predicts, to limit the memory
 
 
 class Predicted(NamedTuple):
-    """The predicted last frames of n trajectories. Quantities that are not predicted are None.
+    """The predicted frames of n trajectories, such as the last ones. Quantities that are not predicted are None.
 
     If a prediction is a distribution, `samples` has k samples, and `visual`, `tactile` and `pose` describe its centre.
     """
@@ -129,15 +130,17 @@ def predict(
     blank: np.ndarray | None = None,
     num_samples: int = 0,
 ) -> Predicted:
-    """Predict the last frames of held-out trajectories with a model, from some of its inputs.
+    """Predict the second frames of held-out pairs with a model, from some of the inputs of the first frames.
 
-    The predicted outcome follows from the predicted pose. Outcome probabilities are those of the model, or the shares
-    of the outcomes among its samples. A model of the visual image without a pose gets an outcome if the scenario has
-    two outcomes and `validation` and `blank` are given: `FELL_OFF` if the image shows no object.
+    A one-step model (`Predictor.stride`) is rolled out from `test.frame[:, 0]` to `test.frame[:, 1]`. The predicted
+    outcome follows from the predicted pose. Outcome probabilities are those of the model, or the shares of the outcomes
+    among its samples. A model of the visual image without a pose gets an outcome if the scenario has two outcomes and
+    `validation` and `blank` are given: `FELL_OFF` if the image shows no object.
 
     Args:
-        predictor: A `sts_jax.Predictor`, or any object with its `__call__`, `prior` and `preprocessing`.
-        test: The held-out trajectories, with images of the resolution that the model expects.
+        predictor: A `sts_jax.Predictor`, or any object with its `__call__`, `prior`, `rollout` and `preprocessing`.
+        test: The held-out trajectories, with images of the resolution that the model expects. For a one-step model, all
+            pairs have the same number of frames from the first to the second.
         inputs: Names of the inputs, some of `predictor.modalities`, or also `state` for models that accept the true
             pose, shape and mass. Without inputs, the prediction is the model's prior, which has no samples.
         validation: Trajectories for choosing the threshold that separates images with and without an object.
@@ -145,6 +148,42 @@ def predict(
         num_samples: Number of samples of each prediction, or 0 for none.
     """
     names = tuple(inputs)
+    _check(names, test, validation)
+
+    def run(pairs: Pairs, num_samples: int) -> Predicted:
+        return _predicted(predictor, names, pairs, num_samples, _steps(predictor, pairs), last=True)[0]
+
+    out = _judged(run(test, num_samples), test, scenario)
+    unknown = out.pose is None and out.visual is not None and len(scenario.stays) == 1
+    if unknown and validation is not None and blank is not None:
+        score, judged = (np.abs(x - blank).mean((1, 2, 3)) for x in (np.asarray(run(validation, 0).visual), out.visual))
+        empty = judged <= best_threshold(score, validation.outcome != _FELL_OFF)
+        out = out._replace(outcome=np.where(empty, _FELL_OFF, int(scenario.stays[0])))
+    return out
+
+
+@in_32_bits
+def rollout(
+    predictor: Any, inputs: Sequence[str], test: Pairs, scenario: physics.Scenario, *, steps: int, num_samples: int = 0
+) -> list[Predicted]:
+    """Roll out a one-step model from the first frames of held-out pairs, and return the prediction of each step.
+
+    Element i describes the frames `test.frame[:, 0] + (i + 1) * predictor.stride`. All predicted images are held in
+    memory, 12 bytes for each pixel of each stream. The arguments are those of `predict`.
+
+    Args:
+        steps: Number of steps.
+    """
+    names = tuple(inputs)
+    _check(names, test)
+    if predictor.preprocessing.stride is None:
+        raise ValueError("the predictor predicts the last frame, and has no steps: use evaluation.predict")
+    predicted = _predicted(predictor, names, test, num_samples, steps, last=False)
+    return [_judged(out, test, scenario) for out in predicted]
+
+
+def _check(names: tuple[str, ...], test: Pairs, validation: Pairs | None = None) -> None:
+    """Raise a ValueError if there is no trajectory to test, or if pairs lack the measurements among the inputs."""
     if len(test.object) == 0:
         raise ValueError("`test` has 0 trajectories: choose a split with held-out trajectories")
     for name, pairs in (("test", test), ("validation", validation)):
@@ -155,59 +194,91 @@ def predict(
                 f"`{name}` with Dataset.pairs(..., measurements=...)"
             )
 
-    def run(pairs: Pairs, num_samples: int) -> Predicted:
-        """Predict in groups of equal size, to limit the memory. Copies of the last trajectory fill the last group."""
-        count = len(pairs.object)
-        size, parts = min(count, _CHUNK), []
-        keys = jax.random.split(jax.random.key(0), count) if num_samples else None
-        for start in range(0, count, size):
-            rows = np.minimum(np.arange(start, start + size), count - 1)
-            some = None if keys is None else keys[rows]
-            parts.append(_predict_rows(predictor, names, pairs, rows, some, num_samples))
-        return first(joined(parts), count)
 
-    out = run(test, num_samples)
+def _steps(predictor: Any, pairs: Pairs) -> int | None:
+    """Number of steps of a one-step model from the first to the second frames, or None for another model."""
+    stride = predictor.preprocessing.stride
+    if stride is None:
+        return None
+    if pairs.frame is None:
+        raise ValueError("the pairs have no `frame`, which a one-step model needs: make them with Dataset.pairs")
+    apart = np.unique(pairs.frame[:, 1] - pairs.frame[:, 0])
+    if len(apart) > 1 or apart[0] < stride or apart[0] % stride:
+        raise ValueError(
+            f"the two frames of the pairs are {', '.join(map(str, apart[:5]))} frames apart, but a step of the model "
+            f"takes {stride}: make the pairs with Dataset.pairs(..., frames=(t, t + k * {stride})) for one k >= 1"
+        )
+    return int(apart[0]) // stride
+
+
+def _judged(out: Predicted, test: Pairs, scenario: physics.Scenario) -> Predicted:
+    """Add the outcome of the predicted pose, and the outcome probabilities of sampled poses."""
     if out.pose is not None:
         out = out._replace(outcome=outcome_of_pose(scenario, test.pose[:, 0], out.pose))
-    elif out.visual is not None and len(scenario.stays) == 1 and validation is not None and blank is not None:
-        score, judged = (np.abs(x - blank).mean((1, 2, 3)) for x in (np.asarray(run(validation, 0).visual), out.visual))
-        empty = judged <= best_threshold(score, validation.outcome != _FELL_OFF)
-        out = out._replace(outcome=np.where(empty, _FELL_OFF, int(scenario.stays[0])))
     if out.samples is not None and out.samples.pose is not None and out.outcome_probability is None:
         ends = np.stack([outcome_of_pose(scenario, test.pose[:, 0], pose) for pose in out.samples.pose])
         out = out._replace(outcome_probability=shares(ends, scenario.outcomes))
     return out
 
 
+def _predicted(
+    predictor: Any, names: tuple[str, ...], pairs: Pairs, num_samples: int, steps: int | None, *, last: bool
+) -> list[Predicted]:
+    """Predict each step, or only the last one, in groups of equal size, to limit the memory.
+
+    Copies of the last trajectory fill the last group. A model that is no one-step model has no `steps`.
+    """
+    count = len(pairs.object)
+    most = _CHUNK if steps is None or last else _FRAMES // (max(steps, 1) * (num_samples + 1))
+    size, parts = min(count, _CHUNK, max(most, 1)), []
+    keys = jax.random.split(jax.random.key(0), count) if num_samples else None
+    for start in range(0, count, size):
+        rows = np.minimum(np.arange(start, start + size), count - 1)
+        some = None if keys is None else keys[rows]
+        out = _predict_rows(predictor, names, pairs, rows, some, num_samples, steps, last=last)
+        number = 0 if steps is None else 1 if last else steps
+        frames = [_mapped(lambda axis, leaf, i=i: leaf.take(i, axis + 1), out) for i in range(number)]
+        parts.append(frames or [out])
+    return [first(joined(groups), count) for groups in zip(*parts, strict=True)]
+
+
 def _predict_rows(
-    predictor: Any, names: tuple[str, ...], pairs: Pairs, rows: np.ndarray, key: Any, num_samples: int
+    predictor: Any,
+    names: tuple[str, ...],
+    pairs: Pairs,
+    rows: np.ndarray,
+    key: Any,
+    num_samples: int,
+    steps: int | None,
+    *,
+    last: bool,
 ) -> Predicted:
     """Predict the trajectories `rows` of `pairs` from the inputs `names`. The images of samples become `uint8`."""
     condition = pairs.condition[rows] if pairs.condition.shape[1] else None
     further = {name: in_unit(pairs.measurements[name][rows, 0]) for name in names if name in pairs.measurements}
-    if names:
+    given: dict[str, Any] = {
+        name: getattr(pairs, name)[rows, 0] / 255 for name in ("visual", "tactile") if name in names
+    }
+    if "pose" in names:
+        given["pose"] = pairs.pose[rows, 0]
+    if "state" in names:
+        truth = (pairs.pose[rows, 0], pairs.support[rows], pairs.mass[rows], pairs.com[rows])
+        given["state"] = training.state_codes(predictor.preprocessing, *truth)
+    drawn = {"condition": condition, "key": key, "num_samples": num_samples}
+    if steps is not None:
+        view = predictor.preprocessing
+        time = 0.0 if pairs.frame is None else pairs.frame[rows, 0] * view.period / view.stride
+        out = predictor.rollout(given | further, steps, time=time, last=last, **drawn)
+    elif names:
         masks = {name: ~np.isnan(x).reshape(len(rows), -1).any(-1) for name, x in further.items()}
-        state = None
-        if "state" in names:
-            truth = (pairs.pose[rows, 0], pairs.support[rows], pairs.mass[rows], pairs.com[rows])
-            state = training.state_codes(predictor.preprocessing, *truth)
-        out = predictor(
-            visual=pairs.visual[rows, 0] / 255 if "visual" in names else None,
-            tactile=pairs.tactile[rows, 0] / 255 if "tactile" in names else None,
-            pose=pairs.pose[rows, 0] if "pose" in names else None,
-            condition=condition,
-            state=state,
-            key=key,
-            num_samples=num_samples,
-            **({"measurements": further, "present": masks} if further else {}),
-        )
+        out = predictor(**given, **drawn, **({"measurements": further, "present": masks} if further else {}))
     else:
         out = predictor.prior((len(rows),), condition=condition)
     samples = None
     if out.samples is not None:
         images = (out.samples.visual, out.samples.tactile)
-        drawn, felt = (None if leaf is None else np.round(255 * np.asarray(leaf)).astype(np.uint8) for leaf in images)
-        samples = Predicted(drawn, felt, None if out.samples.pose is None else np.asarray(out.samples.pose))
+        seen, felt = (None if leaf is None else np.round(255 * np.asarray(leaf)).astype(np.uint8) for leaf in images)
+        samples = Predicted(seen, felt, None if out.samples.pose is None else np.asarray(out.samples.pose))
     centre = Predicted(
         out.visual,
         out.tactile,
