@@ -23,6 +23,8 @@ from sts_jax.storage import DamagedFileError, write_bytes
 
 _KINDS: dict[str, type] = {kind.__name__: kind for kind in (Frame, Body, Trajectory)}
 _INCH = 2.6  # height of a panel (inches)
+_STRIP = 12.0  # width of a strip of frames (inches)
+_WIDE = 2.5  # least width of a strip in multiples of its height
 _FORMAT = 1  # version of the layout of .npz files
 
 
@@ -41,15 +43,19 @@ def show(thing: Frame | Body | Prediction | ArrayLike, *, title: str = "") -> Fi
     Args:
         thing: One item. A `Frame` gives its visual and tactile image, depth (mm) and pressure (kPa), a `Body` an
             outside view on a pad, and a `Prediction` its images. An array (height, width, 3) of floats in [0, 1] or
-            uint8 is an image. Select item i of a batch with `jax.tree.map(lambda x: x[i], frames)`.
+            uint8 is an image. Images (n, height, width, 3), and the steps of a roll-out, are drawn side by side. Select
+            item i of a batch with `jax.tree.map(lambda x: x[i], frames)`.
         title: Title of the figure. By default, the description of a `Body`, and no title otherwise.
     """
     panels = _panels(thing)
     if isinstance(thing, Body):
         title = title or repr(thing)
     height = _INCH if len(panels) > 1 else 1.5 * _INCH
-    figure = NotebookFigure(figsize=(1.15 * height * len(panels), height + 0.4), layout="constrained")
-    for axes, panel in zip(np.ravel(figure.subplots(1, len(panels))), panels, strict=True):
+    rows, columns, size = 1, len(panels), (1.15 * height * len(panels), height + 0.4)
+    if (aspect := panels[0].values.shape[1] / panels[0].values.shape[0]) > _WIDE:  # strips are stacked
+        rows, columns, size = len(panels), 1, (_STRIP, (_STRIP / aspect + 0.3) * len(panels) + 0.4)
+    figure = NotebookFigure(figsize=size, layout="constrained")
+    for axes, panel in zip(np.ravel(figure.subplots(rows, columns)), panels, strict=True):
         drawn = axes.imshow(panel.values, cmap=panel.colours)
         if panel.colours is not None:
             figure.colorbar(drawn, ax=axes, shrink=0.8)
@@ -87,13 +93,18 @@ def _panels(thing: Frame | Body | Prediction | ArrayLike) -> list[_Panel]:
         return [_Panel("", np.asarray(outside(thing, pose, jnp.asarray(Sensor().gel.size), resolution=(400, 400))))]
     if isinstance(thing, Prediction):
         streams = {"visual": thing.visual, "tactile": thing.tactile}
-        panels = [_Panel(f"predicted {name}", np.asarray(x)) for name, x in streams.items() if x is not None]
+        panels = [_Panel(f"predicted {name}", np.asarray(_strip(x))) for name, x in streams.items() if x is not None]
         if not panels:
             raise ValueError("the prediction has no image, because its model predicts none: print it instead")
         for panel in panels:
             _check_single("Prediction", panel.values, 3)
         return panels
-    return [_Panel("", _image(thing))]
+    return [_Panel("", _image(_strip(thing)))]
+
+
+def _strip(images: Any) -> Any:
+    """Join images (n, height, width, 3) side by side. Anything else stays as it is."""
+    return np.concatenate(np.asarray(images), axis=1) if np.ndim(images) == 4 and len(images) else images
 
 
 def save(path: str | os.PathLike[str], thing: Frame | Body | Trajectory | ArrayLike) -> None:

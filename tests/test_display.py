@@ -126,6 +126,18 @@ def test_a_figure_has_the_panels_of_its_object(thing, panels):
     np.testing.assert_allclose(figure.axes[0].images[0].get_array(), image / (255 if image.dtype == np.uint8 else 1))
 
 
+def test_the_steps_of_a_rollout_are_drawn_side_by_side():
+    steps = jnp.stack([FRAME.visual, 1 - FRAME.visual, FRAME.tactile, FRAME.tactile])
+    figure = sts.show(sts.Prediction(steps, 1 - steps, None, jnp.zeros((4, 2)), jnp.zeros((4, 2))))
+    upper, lower = (axes.images[0].get_array() for axes in figure.axes)
+    assert upper.shape == (4, 24, 3)
+    np.testing.assert_array_equal(upper[:, 6:12], 1 - FRAME.visual)
+    np.testing.assert_allclose(lower, 1 - upper, atol=1e-6)
+    np.testing.assert_array_equal(sts.show(steps).axes[0].images[0].get_array(), upper)
+    with pytest.raises(ValueError, match=r"the Prediction has leading axes \(1, 4\)"):
+        sts.show(sts.Prediction(steps[None], None, None, None, None))
+
+
 def test_a_body_is_drawn_from_outside():
     picture = sts.show(BODY).axes[0].images[0].get_array()
     assert picture.shape == (400, 400, 3)
