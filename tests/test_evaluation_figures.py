@@ -11,9 +11,9 @@ from PIL import Image
 from test_evaluation_results import judged
 
 import sts_jax as sts
-from sts_jax import evaluation
-from sts_jax.evaluation import figures
-from sts_jax.evaluation.figures import motion, pictures
+from sts_jax import dataset, evaluation
+from sts_jax.evaluation import Curve, Predicted, figures
+from sts_jax.evaluation.figures import motion, pictures, sheets
 
 FRAMES = 5
 TIME = np.linspace(0, 1, FRAMES)
@@ -27,6 +27,7 @@ def drawn(monkeypatch):
     """The figures that are drawn, instead of files."""
     found = []
     monkeypatch.setattr(pictures, "save", lambda figure, path: found.append(figure))
+    monkeypatch.setattr(sheets, "_save", lambda figure, path: found.append(figure))
     yield found
     for figure in found:
         plt.close(figure)
@@ -127,3 +128,139 @@ def test_a_slope_is_drawn_as_a_slope():
     np.testing.assert_allclose(place(0.06 * up, 9.81 * up), level, atol=2)  # the object above the pad is drawn above it
     downhill = place(jnp.array([0.0, 0.04, 0.06]), 9.81 * up)
     assert downhill[0] > place(jnp.array([0.0, 0.04, 0.06]), None)[0] + 8
+
+
+NAMES = ("bottle", "fork", "bottle")
+SCENE = {"scenario": sts.physics.Freefall(), "names": NAMES, "title": "t"}
+
+
+def shown(figure):
+    """The images of a figure in the order of drawing: from the top row to the bottom, from left to right."""
+    return [np.asarray(axis.images[0].get_array()) for axis in figure.axes if axis.images]
+
+
+def test_a_column_is_chosen_for_each_class_and_then_for_each_object():
+    test, _ = judged()  # objects 0, 0, 1, 1, 2, 2
+    assert figures.one_of_each(test, NAMES, 2).tolist() == [0, 2]
+    assert figures.one_of_each(test, NAMES, 9).tolist() == [0, 2, 4, 1, 3, 5]
+    assert figures.one_of_each(test, ("fork", "bottle", "bottle"), 3).tolist() == [2, 0, 4]
+
+
+def test_a_pose_sheet_shows_inputs_predictions_and_truth(tmp_path, drawn):
+    test, predicted = judged()
+    items = np.array([0, 3])
+    figures.pose_sheet(tmp_path / "a.png", test, predicted, items, size=(0.15, 0.15), **SCENE)
+    rows = [test.visual[items, 0], test.tactile[items, 0], predicted.visual[items], test.visual[items, 1]]
+    rows = [image for row in [*rows, predicted.tactile[items], test.tactile[items, 1]] for image in row]
+    for image, wanted in zip(shown(drawn[0]), rows, strict=True):
+        np.testing.assert_allclose(image, wanted / 255 if wanted.dtype == np.uint8 else wanted, rtol=1e-6)
+    texts = [text.get_text() for text in drawn[0].texts]
+    labels = [
+        "visual input",
+        "tactile input",
+        *(f"{w} {s}" for s in ("visual", "tactile") for w in ("predicted", "true")),
+    ]
+    assert [text for text in texts if text in labels] == labels
+    assert "bottle\nrests" in texts
+    assert "fork\nfell off" in texts
+
+
+def test_the_predicted_frame_is_solid_and_the_true_one_dashed(drawn, tmp_path):
+    test, predicted = judged(2)
+    up, arm = np.array([1.0, 0, 0, 0]), 0.3 * 0.15
+    test.pose[:, 1] = [0, 0, 0.02, *up]
+    predicted = predicted._replace(pose=np.array([[0, 0, 0.02, *up], [0, 0.04, 0.02, *up]]))
+    figures.pose_sheet(tmp_path / "a.png", test, predicted, np.array([0, 1]), size=(0.15, 0.15), **SCENE)
+    same, other = ([line.get_xydata() for line in axis.lines] for axis in drawn[0].axes[-2:])
+    styles = [line.get_linestyle() for line in drawn[0].axes[-1].lines]
+    assert styles == ["-"] * 3 + ["--"] * 3
+    np.testing.assert_allclose(same[:3], same[3:], atol=1e-9)
+    lengths = [np.linalg.norm(end - start) for start, end in same[:3]]
+    view = np.array([0.25, 0.53, 0.35]) / np.linalg.norm([0.25, 0.53, 0.35])
+    np.testing.assert_allclose(lengths, arm * np.sqrt(1 - view**2), rtol=1e-6)  # a parallel projection
+    assert other[2][1][1] > other[2][0][1]  # up is up
+    assert other[0][0][1] < other[3][0][1]  # what is nearer is lower
+    assert not drawn[0].axes[-1].texts
+
+
+def test_a_frame_off_the_pad_is_named_and_an_outline_is_the_projected_hull(drawn, tmp_path):
+    test, predicted = judged(2)
+    fork = sts.objects.make(jax.random.key(0), "fork")
+    test.pose[:, 1] = [0, 0, 0.01, 1, 0, 0, 0]
+    predicted = predicted._replace(pose=np.array([[0, 0, -0.4, 1, 0, 0, 0]] * 2))
+    figures.pose_sheet(tmp_path / "a.png", test, predicted, np.array([1]), size=(0.15, 0.15), bodies=[fork], **SCENE)
+    axis = drawn[0].axes[-1]
+    assert axis.texts[0].get_text() == "predicted:\noff the pad"
+    _, below, above = (patch.get_xy() for patch in axis.patches)
+    length = np.asarray(fork.hulls)[..., 2].max() - np.asarray(fork.hulls)[..., 2].min()
+    np.testing.assert_allclose(np.ptp(below, axis=0), np.ptp(above, axis=0), rtol=1e-6)
+    assert 0.7 * length < np.ptp(above[:, 1]) < 1.2 * length  # the fork stands
+
+
+def test_a_sheet_of_models_leaves_out_what_a_model_does_not_predict(tmp_path, drawn):
+    test, both = judged()
+    models = {"VAE visual": Predicted(visual=both.visual), "VAE tactile": Predicted(tactile=both.tactile), "MVAE": both}
+    figures.models_sheet(tmp_path / "a.png", test, models, np.array([1]), **SCENE)
+    labels = [text.get_text() for text in drawn[0].texts][1:-1]
+    streams = [[f"true {s}", f"VAE {s}\n{s}", f"MVAE\n{s}"] for s in ("visual", "tactile")]
+    assert labels == ["visual input", "tactile input", *streams[0], *streams[1]]
+    np.testing.assert_allclose(shown(drawn[0])[7], both.tactile[1], rtol=1e-6)
+
+
+def test_a_crossed_sheet_predicts_each_stream_from_the_other(tmp_path, drawn):
+    test, both = judged()
+    from_touch, from_vision = Predicted(visual=both.visual), Predicted(tactile=both.tactile)
+    figures.crossed_sheet(tmp_path / "a.png", test, from_touch, from_vision, np.array([2]), **SCENE)
+    wanted = [test.tactile[2, 0] / 255, both.visual[2], test.visual[2, 1] / 255]
+    wanted += [test.visual[2, 0] / 255, both.tactile[2], test.tactile[2, 1] / 255]
+    np.testing.assert_allclose(shown(drawn[0]), wanted, rtol=1e-6)
+
+
+def test_a_strip_of_a_roll_out_has_the_truth_of_the_same_time(tmp_path, drawn):
+    rng, stride, steps = np.random.default_rng(0), 2, 7
+    images = dataset.Images(*(rng.random((15, 8, 8, 3)) for _ in range(2)), segmentation=None)
+    rolled = [Predicted(visual=rng.random((3, 8, 8, 3))) for _ in range(steps)]
+    direct = Predicted(visual=rng.random((3, 8, 8, 3)))
+    time = 0.1 * np.arange(15)
+    figures.rollout_strip(tmp_path / "a.png", time, images, rolled, 1, stride=stride, direct=direct, num=3)
+    found = shown(drawn[0])
+    np.testing.assert_allclose(found[:5], images.visual[[0, 2, 6, 14, 14]])
+    np.testing.assert_allclose(
+        found[5:], [rolled[0].visual[1], rolled[2].visual[1], rolled[6].visual[1], direct.visual[1]]
+    )
+    heads = [text.get_text() for text in drawn[0].texts][-5:]
+    assert heads == ["0.00 s\ninput", "0.20 s", "0.60 s", "1.40 s", "1.40 s\ndirect"]
+
+
+def test_a_sheet_is_a_small_picture(tmp_path):
+    test, predicted = judged(24)
+    noise = np.random.default_rng(0).integers(0, 256, (24, 2, 64, 64, 3), np.uint8)
+    test = test._replace(visual=noise, tactile=noise // 8 + 100, object=np.zeros(24, int))
+    predicted = predicted._replace(visual=noise[:, 0] // 8, tactile=noise[:, 0] // 8)
+    path = tmp_path / "a.png"
+    figures.pose_sheet(path, test, predicted, np.arange(6), size=(0.15, 0.15), **SCENE)
+    assert path.stat().st_size < 900_000  # noise; real images are far smaller
+    with Image.open(path) as picture:
+        assert picture.width < 1200
+
+
+def test_curves_are_means_over_the_objects_that_stay(tmp_path, drawn):
+    test, predicted = judged()
+    near = predicted._replace(pose=test.pose[:, 1] + np.float32([0.003, 0, 0, 0, 0, 0, 0]))
+    curve = evaluation.error_curve([0.1, 0.2], [(near, test), (predicted, test)])
+    stays = test.outcome == 0
+    error = evaluation.metrics.image_error(predicted.visual, test.visual[:, 1] / 255)
+    np.testing.assert_allclose(curve.errors["visual"][1], error.excess / error.pixels)
+    assert np.isnan(curve.errors["position"][:, ~stays]).all()
+    np.testing.assert_allclose(curve.errors["position"][0, stays], 0.003, rtol=1e-4)
+    last = Curve(np.array([0.2]), {"visual": curve.errors["visual"][1:]})
+    curves = {"steps": curve, "last frame": last, "copy of the input": curve}
+    figures.error_curves(tmp_path / "a.png", curves, test.object, title="t", num=50)
+    position, visual, _ = drawn[0].axes
+    np.testing.assert_allclose(position.lines[0].get_ydata()[0], 3, rtol=1e-4)  # mm
+    np.testing.assert_allclose(visual.lines[0].get_ydata(), 1e4 * curve.errors["visual"].mean(1))
+    np.testing.assert_allclose(visual.lines[0].get_xdata(), [0.1, 0.2])
+    assert len(visual.containers) == 1  # the point of the last frame
+    assert visual.lines[-1].get_linestyle() == "--"
+    band = visual.collections[0].get_paths()[0].vertices[:, 1]
+    assert band.min() < 1e4 * curve.errors["visual"][1].mean() < band.max()

@@ -3,6 +3,7 @@
 from sts_jax.evaluation import figures as figures
 from sts_jax.evaluation import gap as gap
 from sts_jax.evaluation import metrics as metrics
+from sts_jax.evaluation import probes as probes
 from sts_jax.evaluation.catalogue import CALIBRATION as CALIBRATION
 from sts_jax.evaluation.catalogue import COLUMNS as COLUMNS
 from sts_jax.evaluation.catalogue import LOG_LOSS as LOG_LOSS
@@ -11,6 +12,8 @@ from sts_jax.evaluation.catalogue import Column as Column
 from sts_jax.evaluation.catalogue import Metric as Metric
 from sts_jax.evaluation.catalogue import Scores as Scores
 from sts_jax.evaluation.catalogue import measurement_error as measurement_error
+from sts_jax.evaluation.figures.curves import Curve as Curve
+from sts_jax.evaluation.figures.curves import error_curve as error_curve
 from sts_jax.evaluation.figures.motion import outside as outside
 from sts_jax.evaluation.predictions import TRUE_STATE as TRUE_STATE
 from sts_jax.evaluation.predictions import Predicted as Predicted
@@ -24,6 +27,8 @@ from sts_jax.evaluation.predictions import rows_of as rows_of
 from sts_jax.evaluation.predictions import shares as shares
 from sts_jax.evaluation.predictions import subsets as subsets
 from sts_jax.evaluation.predictions import train_share as train_share
+from sts_jax.evaluation.probes import probe as probe
+from sts_jax.evaluation.probes import probes_table as probes_table
 from sts_jax.evaluation.references import BASELINES as BASELINES
 from sts_jax.evaluation.references import CEILING as CEILING
 from sts_jax.evaluation.references import CEILINGS as CEILINGS

@@ -156,7 +156,7 @@ def summarise(
                     draws[:, i, k] = np.nan
 
     def cells(values: np.ndarray, sample: np.ndarray) -> dict:
-        return {key: _cell(values[k], sample[:, k]) for k, key in enumerate(keys)}
+        return {key: cell(values[k], sample[:, k]) for k, key in enumerate(keys)}
 
     rows = list(scores)
     reference = {name: rows.index(name) for name in BASELINES}
@@ -214,7 +214,7 @@ def gain(
         return np.asarray(skill(after[metric], before[metric], weight))
 
     value = float(statistic(np.ones(len(before[metric]))))
-    return _cell(value, bootstrap(test.object, statistic, num=num, seed=seed))
+    return cell(value, bootstrap(test.object, statistic, num=num, seed=seed))
 
 
 def image_summary(
@@ -262,13 +262,13 @@ def _of_stream(predictions: Mapping[str, Predicted], test: Streams, stream: str,
 
     value, draws = numbers(np.ones(len(truth))), bootstrap(np.arange(len(truth)), numbers, num=num, seed=seed)
     cells = {
-        name: {key: _cell(value[i, k], draws[:, i, k]) for k, key in enumerate(("bce", "skill", "skill_copy"))}
+        name: {key: cell(value[i, k], draws[:, i, k]) for k, key in enumerate(("bce", "skill", "skill_copy"))}
         for i, name in enumerate(errors)
     }
     return {"floor": ratio(constant.bce - constant.excess, constant.pixels), "predictors": cells}
 
 
-def _cell(number: float, sample: np.ndarray) -> dict | None:
+def cell(number: float, sample: np.ndarray) -> dict | None:
     """A value and its interval from bootstrap samples, or None if the value is not finite."""
     if not np.isfinite(number):
         return None
@@ -291,13 +291,13 @@ def table(
         rows: Names of the predictors, in the order of the rows (default: all).
         columns: The columns of metrics, from left to right.
     """
-    lines = _head(["predictor", *(column.heading for column in columns)])
+    lines = head(["predictor", *(column.heading for column in columns)])
     for name in summary["predictors"] if rows is None else rows:
         cells = [
             [_shown(summary["predictors"][name], metric, interval=metric.interval) for metric in column.metrics]
             for column in columns
         ]
-        lines.append(_row([name, *("-" if set(cell) == {"-"} else " / ".join(cell) for cell in cells)]))
+        lines.append(row([name, *("-" if set(cell) == {"-"} else " / ".join(cell) for cell in cells)]))
     return _page(summary, title, [metric for column in columns for metric in column.metrics], lines, notes)
 
 
@@ -308,16 +308,16 @@ def full_table(summary: dict, *, title: str, notes: Sequence[str] = (), metrics:
         summary: The result of `summarise`.
         metrics: The metrics, in the order of the columns.
     """
-    lines = _head(["predictor", *(metric.title for metric in metrics)])
+    lines = head(["predictor", *(metric.title for metric in metrics)])
     for name, cells in summary["predictors"].items():
-        lines.append(_row([name, *(_shown(cells, metric, interval=metric.interval) for metric in metrics)]))
+        lines.append(row([name, *(_shown(cells, metric, interval=metric.interval) for metric in metrics)]))
     compared = [metric for metric in metrics if metric.compared is not None]
-    lines += ["", _directions(compared), "", *_head(["predictor", "baseline", *(metric.title for metric in compared)])]
+    lines += ["", _directions(compared), "", *head(["predictor", "baseline", *(metric.title for metric in compared)])]
     for name, against in summary["differences"].items():
         for base, differences in against.items():
             texts = [_shown(differences, metric, interval=True) for metric in compared]
             if set(texts) != {"-"}:
-                lines.append(_row([name, base, *texts]))
+                lines.append(row([name, base, *texts]))
     return _page(summary, title, metrics, lines, notes)
 
 
@@ -335,11 +335,13 @@ def aligned(rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("  ".join(map(str.ljust, row, widths)).rstrip() for row in rows)
 
 
-def _head(cells: Sequence[str]) -> list[str]:
-    return [_row(cells), "|---" * len(cells) + "|"]
+def head(cells: Sequence[str]) -> list[str]:
+    """The first two lines of a Markdown table: the headings of its columns."""
+    return [row(cells), "|---" * len(cells) + "|"]
 
 
-def _row(cells: Sequence[str]) -> str:
+def row(cells: Sequence[str]) -> str:
+    """A line of a Markdown table."""
     return f"| {' | '.join(cells)} |"
 
 
@@ -347,10 +349,10 @@ def _shown(cells: Mapping[str, dict | None], metric: Metric, *, interval: bool) 
     """The text of a cell: the value of a metric, or "-" if the predictor does not have the metric."""
     if metric.name not in cells:
         raise ValueError(f"summary lacks {metric.name!r}: pass all metrics of the table to score() and summarise()")
-    cell = cells[metric.name]
-    if cell is None:
+    value = cells[metric.name]
+    if value is None:
         return "-"
-    text = written(**cell, digits=metric.digits, factor=metric.factor)
+    text = written(**value, digits=metric.digits, factor=metric.factor)
     return text if interval else text.partition(" ")[0]
 
 

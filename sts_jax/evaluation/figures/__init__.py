@@ -2,6 +2,7 @@
 
 from sts_jax.evaluation.figures.curves import calibration as calibration
 from sts_jax.evaluation.figures.curves import ends as ends
+from sts_jax.evaluation.figures.curves import error_curves as error_curves
 from sts_jax.evaluation.figures.curves import training_curves as training_curves
 from sts_jax.evaluation.figures.motion import SLOWER as SLOWER
 from sts_jax.evaluation.figures.motion import animation as animation
@@ -10,3 +11,8 @@ from sts_jax.evaluation.figures.pictures import SAMPLES as SAMPLES
 from sts_jax.evaluation.figures.pictures import comparison as comparison
 from sts_jax.evaluation.figures.pictures import predictions as predictions
 from sts_jax.evaluation.figures.pictures import side_by_side as side_by_side
+from sts_jax.evaluation.figures.sheets import crossed_sheet as crossed_sheet
+from sts_jax.evaluation.figures.sheets import models_sheet as models_sheet
+from sts_jax.evaluation.figures.sheets import one_of_each as one_of_each
+from sts_jax.evaluation.figures.sheets import pose_sheet as pose_sheet
+from sts_jax.evaluation.figures.sheets import rollout_strip as rollout_strip

@@ -1,17 +1,26 @@
-"""Figures of numbers: training, calibration and last positions. Each function writes one file."""
+"""Figures of numbers: training, calibration, last positions, and errors over time."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.patches import Rectangle
 
+from sts_jax import physics
+from sts_jax.dataset import Pairs
 from sts_jax.evaluation import metrics
 from sts_jax.evaluation.catalogue import CALIBRATION, Scores
 from sts_jax.evaluation.figures import pictures
+from sts_jax.evaluation.predictions import Predicted, in_unit
 
 _POSSIBLE, _PREDICTED = "tab:blue", "tab:orange"  # colours of simulated and of predicted last poses
+_ERRORS = {  # factor and title of the panel of each error over time
+    "position": (1e3, "position, on the pad (mm)"),
+    "visual": (1e4, "visual excess (1e-4 nats)"),
+    "tactile": (1e4, "tactile excess (1e-4 nats)"),
+}
 
 
 def training_curves(path: Path, logs: Mapping[str, Sequence[Mapping[str, float]]]) -> None:
@@ -124,5 +133,90 @@ def ends(
     handles, labels = axes[0].get_legend_handles_labels()
     model, name = axes[1].get_legend_handles_labels()
     figure.legend([*handles, model[-1]], [*labels, name[-1]], loc="outside lower center", ncols=4, fontsize=10)
+    figure.suptitle(title, fontsize=11)
+    pictures.save(figure, path)
+
+
+class Curve(NamedTuple):
+    """Errors of n predicted trajectories over time, or of a prediction of the last frame only, which has one time."""
+
+    time: np.ndarray  # (s,) times of the predicted frames (s)
+    errors: dict[str, np.ndarray]  # (s, n) by name, see `error_curve`, NaN where an error does not count
+
+
+def error_curve(time: np.ndarray, steps: Iterable[tuple[Predicted, Pairs]]) -> Curve:
+    """Compute the errors of predicted frames: `position` (m), and `visual` and `tactile` excess (nats per value).
+
+    The position counts for objects that stay on the pad. What is not predicted is left out.
+
+    Args:
+        time: Times of the predicted frames (s), `(s,)`.
+        steps: For each time, the prediction and the pairs whose later frame it predicts, such as
+            `(predicted, data.pairs(rows, frames=(0, t)))`. An iterator need not keep all images in memory.
+    """
+    errors: dict[str, list[np.ndarray]] = {}
+    for predicted, pairs in steps:
+        if predicted.pose is not None:
+            position = metrics.position_error(predicted.pose, pairs.pose[:, 1])
+            position = np.where(pairs.outcome == int(physics.Outcome.FELL_OFF), np.nan, position)
+            errors.setdefault("position", []).append(position)
+        for stream in ("visual", "tactile"):
+            images = getattr(predicted, stream)
+            if images is not None:
+                error = metrics.image_error(in_unit(images), in_unit(getattr(pairs, stream)[:, 1]))
+                errors.setdefault(stream, []).append(error.excess / error.pixels)
+    return Curve(np.asarray(time), {name: np.stack(values) for name, values in errors.items()})
+
+
+def error_curves(
+    path: Path,
+    curves: Mapping[str, Curve],
+    objects: np.ndarray,
+    *,
+    plain: Sequence[str] = ("copy of the input",),
+    title: str,
+    num: int = 500,
+) -> None:
+    """Draw mean errors over time, with a panel for each quantity and a 95 % bootstrap interval over objects.
+
+    Args:
+        curves: From `error_curve`, by the name of the model. A curve with one time is drawn as a point.
+        objects: Object of each trajectory, `(n,)`.
+        plain: Names of the curves that are dashed and without interval, such as baselines.
+    """
+    panels = [name for name in _ERRORS if any(name in curve.errors for curve in curves.values())]
+    figure, axes = plt.subplots(1, len(panels), figsize=(4.1 * len(panels), 3.6), squeeze=False)
+    colours = {name: f"C{i}" for i, name in enumerate(name for name in curves if name not in plain)}
+    for axis, panel in zip(axes[0], panels, strict=True):
+        factor, label = _ERRORS[panel]
+        for name, (time, errors) in curves.items():
+            if panel not in errors:
+                continue
+            values = factor * errors[panel]
+
+            def mean(weight: np.ndarray, values: np.ndarray = values) -> np.ndarray:
+                w = weight * np.isfinite(values)
+                total = w.sum(1)
+                return np.where(total > 0, (w * np.nan_to_num(values)).sum(1) / np.maximum(total, 1), np.nan)
+
+            line = mean(np.ones(len(objects)))
+            if name in plain:
+                axis.plot(time, line, "--", color="0.4", label=name, linewidth=1.3)
+                continue
+            draws = metrics.bootstrap(objects, mean, num=num)
+            low, high = np.transpose([metrics.interval(draw) for draw in draws.T])
+            if len(time) == 1:
+                axis.errorbar(
+                    time, line, (line - low, high - line), fmt="o", color=colours[name], label=name, capsize=3
+                )
+            else:
+                axis.plot(time, line, color=colours[name], label=name, linewidth=1.5)
+                axis.fill_between(time, low, high, color=colours[name], alpha=0.2, linewidth=0)
+        axis.set_xlabel("time (s)")
+        axis.set_title(label, fontsize=10)
+        axis.set_ylim(bottom=0)
+        axis.grid(alpha=0.3)
+    every = {label: handle for axis in axes[0] for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    figure.legend(every.values(), every.keys(), loc="outside lower center", ncols=min(3, len(every)), fontsize=9)
     figure.suptitle(title, fontsize=11)
     pictures.save(figure, path)
