@@ -144,7 +144,7 @@ class Curve(NamedTuple):
     errors: dict[str, np.ndarray]  # (s, n) by name, see `error_curve`, NaN where an error does not count
 
 
-def error_curve(time: np.ndarray, steps: Iterable[tuple[Predicted, Pairs]]) -> Curve:
+def error_curve(time: Sequence[float] | np.ndarray, steps: Iterable[tuple[Predicted, Pairs]]) -> Curve:
     """Compute the errors of predicted frames: `position` (m), and `visual` and `tactile` excess (nats per value).
 
     The position counts for objects that stay on the pad. What is not predicted is left out.
@@ -180,13 +180,14 @@ def error_curves(
     """Draw mean errors over time, with a panel for each quantity and a 95 % bootstrap interval over objects.
 
     Args:
-        curves: From `error_curve`, by the name of the model. A curve with one time is drawn as a point.
+        curves: From `error_curve`, by the name of the model. A curve with one time is drawn as a point. Names that are
+            equal up to a comma, such as "MVAE, roll-out" and "MVAE, last frame", have the same colour.
         objects: Object of each trajectory, `(n,)`.
         plain: Names of the curves that are dashed and without interval, such as baselines.
     """
     panels = [name for name in _ERRORS if any(name in curve.errors for curve in curves.values())]
     figure, axes = plt.subplots(1, len(panels), figsize=(4.1 * len(panels), 3.6), squeeze=False)
-    colours = {name: f"C{i}" for i, name in enumerate(name for name in curves if name not in plain)}
+    models = list(dict.fromkeys(name.partition(",")[0] for name in curves if name not in plain))
     for axis, panel in zip(axes[0], panels, strict=True):
         factor, label = _ERRORS[panel]
         for name, (time, errors) in curves.items():
@@ -203,15 +204,13 @@ def error_curves(
             if name in plain:
                 axis.plot(time, line, "--", color="0.4", label=name, linewidth=1.3)
                 continue
-            draws = metrics.bootstrap(objects, mean, num=num)
+            colour, draws = f"C{models.index(name.partition(',')[0])}", metrics.bootstrap(objects, mean, num=num)
             low, high = np.transpose([metrics.interval(draw) for draw in draws.T])
             if len(time) == 1:
-                axis.errorbar(
-                    time, line, (line - low, high - line), fmt="o", color=colours[name], label=name, capsize=3
-                )
+                axis.errorbar(time, line, (line - low, high - line), fmt="o", color=colour, label=name, capsize=3)
             else:
-                axis.plot(time, line, color=colours[name], label=name, linewidth=1.5)
-                axis.fill_between(time, low, high, color=colours[name], alpha=0.2, linewidth=0)
+                axis.plot(time, line, color=colour, label=name, linewidth=1.5)
+                axis.fill_between(time, low, high, color=colour, alpha=0.2, linewidth=0)
         axis.set_xlabel("time (s)")
         axis.set_title(label, fontsize=10)
         axis.set_ylim(bottom=0)

@@ -22,15 +22,18 @@ from sts_jax.objects import Body
 from sts_jax.storage import write_bytes
 
 STREAMS = ("visual", "tactile")
-_SIDE, _TALL = 1.0, 1.15  # inches, side of an image and width of a pose, height of a pose
-_LABEL, _LINE, _LEGEND = 1.2, 0.17, 0.32  # inches, width of the labels, height of a line of text and of the legend
+_SIDE, _TALL = 1.0, 1.05  # inches, side of an image and width of a pose, height of a pose
+# Inches, width of the labels, height of a line of text and of the legend, times the scale of the sheet's text
+_LABEL, _LINE, _LEGEND = 1.2, 0.17, 0.32
+_FONT, _LARGEST = 8.5, 1.5  # points, size of the text, and largest scale, for wide sheets that a page shows smaller
 _GAP, _APART = 0.04, 0.12  # inches, between images, and between groups of rows
 _DPI = 128  # pixels per inch: a pixel of an image of 64 x 64 covers 2 x 2 pixels of the sheet
-_COLOURS = 200  # number of colours of a sheet, which keeps its file small
+_MOST_BYTES = 280_000
 _TRUE, _PREDICTED = "0.35", "tab:orange"  # colours of true and predicted images and outlines
 _PAD = (0.86, 0.86, 0.92)  # colour
 _AXES = ("tab:red", "tab:green", "tab:blue")  # colours of the x, y and z axis of a coordinate frame
-_ARM = 0.3  # length of the axes of a coordinate frame, as a share of the pad's width
+_ARM = 0.4  # length of the axes of a coordinate frame, as a share of the pad's width
+_BELOW = -0.02  # m, height of a frame below which its object has left the pad
 _VIEWER = np.array([0.25, 0.53, 0.35])  # direction from the pad to the viewer of the poses
 
 
@@ -207,25 +210,29 @@ def _sheet(
     last_apart: bool = False,
 ) -> None:
     """Write a sheet with groups of rows. `pose` draws the pose of a column, `last_apart` sets the last column apart."""
-    width = _LABEL + len(heads) * (_SIDE + _GAP) + _APART
-    wrapped = textwrap.fill(title, int(13 * width))  # about thirteen letters fit into an inch
-    above = _LINE * (2.8 + wrapped.count("\n") + max(head.count("\n") for head in heads))
+    scale = min(max(len(heads) / 7, 1), _LARGEST)
+    label_width = scale * _LABEL
+    width = label_width + len(heads) * (_SIDE + _GAP) + _APART
+    wrapped = textwrap.fill(title, int(13 * width / scale))  # about thirteen letters fit into an inch
+    above = scale * _LINE * (2.8 + wrapped.count("\n") + max(head.count("\n") for head in heads))
     images = sum(len(rows) * (_SIDE + _GAP) + _APART for rows in groups)
-    height = above + images + (0 if pose is None else _TALL + _LEGEND)
+    height = above + images + (0 if pose is None else _TALL + scale * _LEGEND)
     figure = plt.figure(figsize=(width, height))
 
+    def left(column: int) -> float:
+        return label_width + column * (_SIDE + _GAP) + _APART * (last_apart and column == len(heads) - 1)
+
     def add(column: int, top: float, tall: float) -> Axes:
-        left = _LABEL + column * (_SIDE + _GAP) + _APART * (last_apart and column == len(heads) - 1)
-        axis = figure.add_axes((left / width, 1 - (top + tall) / height, _SIDE / width, tall / height))
+        axis = figure.add_axes((left(column) / width, 1 - (top + tall) / height, _SIDE / width, tall / height))
         axis.set_xticks([])
         axis.set_yticks([])
         return axis
 
     def name(text: str, middle: float, colour: str) -> None:
-        place = ((_LABEL - 0.08) / width, 1 - middle / height)
-        figure.text(*place, text, ha="right", va="center", fontsize=8.5, color=colour)
+        place = ((label_width - 0.08) / width, 1 - middle / height)
+        figure.text(*place, text, ha="right", va="center", fontsize=scale * _FONT, color=colour)
 
-    figure.text(0.5, 1 - 0.08 / height, wrapped, ha="center", va="top", fontsize=10)
+    figure.text(0.5, 1 - 0.08 / height, wrapped, ha="center", va="top", fontsize=scale * 10)
     top = above
     for rows in groups:
         for label, pictures, predicted in rows:
@@ -240,13 +247,13 @@ def _sheet(
             top += _SIDE + _GAP
         top += _APART
     for column, head in enumerate(heads):
-        left = _LABEL + column * (_SIDE + _GAP) + _SIDE / 2 + _APART * (last_apart and column == len(heads) - 1)
-        figure.text(left / width, 1 - (above - 0.05) / height, head, ha="center", va="bottom", fontsize=8.5)
+        place = ((left(column) + _SIDE / 2) / width, 1 - (above - 0.05) / height)
+        figure.text(*place, head, ha="center", va="bottom", fontsize=scale * _FONT)
     if pose is not None:
         name("pose", top + _TALL / 2, "black")
         for column in range(len(heads)):
             pose(add(column, top, _TALL), column)
-        _legend(figure, outlines)
+        _legend(figure, outlines, scale * _FONT)
     _save(figure, path)
 
 
@@ -256,14 +263,9 @@ def _draw_pose(axis: Axes, size: np.ndarray, true: np.ndarray, predicted: np.nda
     right = np.cross(forward, [0, 0, 1])
     right /= np.linalg.norm(right)
     onto = np.stack([right, np.cross(right, forward)], 1)
-    half = size / 2
-    pad = (
-        np.array([[-half[0], -half[1], 0], [half[0], -half[1], 0], [half[0], half[1], 0], [-half[0], half[1], 0]])
-        @ onto
-    )
+    pad = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * [*size / 2, 0] @ onto
     axis.add_patch(Polygon(pad, facecolor=_PAD, edgecolor="0.6", linewidth=0.8))
-    reach, low = 1.04 * np.abs(pad[:, 0]).max(), 1.06 * pad[:, 1].min()
-    high, left = low + 2 * reach * _TALL / _SIDE, []
+    reach, low, left = 1.04 * np.abs(pad[:, 0]).max(), 1.06 * pad[:, 1].min(), []
     looks: tuple[tuple[str, np.ndarray, str, dict[str, Any]], ...] = (
         ("predicted", predicted, _PREDICTED, {"linewidth": 3.2, "alpha": 0.55, "solid_capstyle": "round"}),
         ("true", true, _TRUE, {"linewidth": 1.3, "linestyle": (0, (2.2, 1.1))}),
@@ -278,25 +280,17 @@ def _draw_pose(axis: Axes, size: np.ndarray, true: np.ndarray, predicted: np.nda
         for k, tint in enumerate(_AXES):
             arm = np.stack([place, place + _ARM * size.min() * turn[:, k]]) @ onto
             axis.plot(*arm.T, color=tint, **look)
-        x, y = place @ onto
-        if abs(x) > reach or not low < y < high:
+        if (np.abs(place[:2]) > size / 2).any() or place[2] < _BELOW:
             left.append(which)
     axis.set_xlim(-reach, reach)
-    axis.set_ylim(low, high)
+    axis.set_ylim(low, low + 2 * reach * _TALL / _SIDE)
     if left:
-        axis.text(
-            0.5,
-            0.98,
-            f"{' and '.join(left)}:\noff the pad",
-            ha="center",
-            va="top",
-            fontsize=7,
-            transform=axis.transAxes,
-        )
+        text = f"{' and '.join(left)}:\noff the pad"
+        axis.text(0.5, 0.98, text, ha="center", va="top", fontsize=_FONT, transform=axis.transAxes)
     axis.spines[:].set(color="0.8", linewidth=0.8)
 
 
-def _legend(figure: plt.Figure, outlines: bool) -> None:
+def _legend(figure: plt.Figure, outlines: bool, fontsize: float) -> None:
     handles = [
         Line2D([], [], color="0.3", linewidth=3.2, alpha=0.55, label="predicted frame"),
         Line2D([], [], color="0.3", linewidth=1.3, linestyle=(0, (2.2, 1.1)), label="true frame"),
@@ -305,15 +299,20 @@ def _legend(figure: plt.Figure, outlines: bool) -> None:
     if outlines:
         handles.insert(1, Patch(facecolor="none", edgecolor=_PREDICTED, label="predicted outline"))
         handles.insert(3, Patch(facecolor="0.75", edgecolor=_TRUE, label="true outline"))
-    figure.legend(handles=handles, loc="lower center", ncols=len(handles), fontsize=8, frameon=False, borderaxespad=0.2)
+    figure.legend(
+        handles=handles, loc="lower center", ncols=len(handles), fontsize=fontsize, frameon=False, borderaxespad=0.2
+    )
 
 
 def _save(figure: plt.Figure, path: Path) -> None:
-    """Write a sheet as a PNG file of few colours, and close it."""
-    buffer, small = io.BytesIO(), io.BytesIO()
+    """Write a sheet as a PNG file, with 256 colours if it would be large otherwise, and close it."""
+    buffer = io.BytesIO()
     try:
-        figure.savefig(buffer, format="png", dpi=_DPI)
+        figure.savefig(buffer, format="png", dpi=_DPI, pil_kwargs={"optimize": True})
     finally:
         plt.close(figure)
-    Image.open(buffer).convert("RGB").quantize(_COLOURS, dither=Image.Dither.NONE).save(small, "png", optimize=True)
-    write_bytes(path, small.getvalue())
+    if buffer.tell() > _MOST_BYTES:
+        few = Image.open(buffer).convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, 2, dither=Image.Dither.NONE)
+        buffer = io.BytesIO()
+        few.save(buffer, "png", optimize=True)
+    write_bytes(path, buffer.getvalue())
