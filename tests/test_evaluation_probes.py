@@ -1,6 +1,6 @@
 """Probes find a linear map that exists, and nothing in shuffled quantities."""
 
-import types
+import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +9,7 @@ import sklearn.linear_model
 from statespace_config import untrained
 from test_evaluation_results import pairs
 
-from sts_jax import evaluation, mvae
+from sts_jax import dataset, evaluation, mvae
 from sts_jax.evaluation import metrics, probes
 
 SIDE = 32
@@ -108,7 +108,8 @@ def frames(count, seed):
     )
     made.pose[..., :3] = 0.02 * rng.normal(size=(count, 2, 3))
     force = rng.normal(size=(count, 4, 6)).astype(np.float32)
-    return made, types.SimpleNamespace(trajectory={"wrench": force})
+    empty = {field.name: None for field in dataclasses.fields(dataset.Dataset)}
+    return made, dataset.Dataset(**empty | {"trajectory": {"wrench": force}})
 
 
 def test_quantities_are_those_of_the_first_of_the_two_frames():
