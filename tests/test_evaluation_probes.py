@@ -10,6 +10,8 @@ from test_evaluation_results import pairs
 from sts_jax import dataset, evaluation, mvae
 from sts_jax.evaluation import metrics, probes
 
+pytestmark = pytest.mark.filterwarnings("ignore:(visual|tactile|pose) ")  # the images and poses are random
+
 SIDE = 32
 NAMES = ("bottle", "fork", "spoon")
 CONFIG = mvae.Config(
