@@ -167,7 +167,7 @@ def test_a_pose_sheet_shows_inputs_predictions_and_truth(tmp_path, drawn):
 
 def test_the_predicted_frame_is_solid_and_the_true_one_dashed(drawn, tmp_path):
     test, predicted = judged(2)
-    up, arm = np.array([1.0, 0, 0, 0]), 0.3 * 0.15
+    up, arm = np.array([1.0, 0, 0, 0]), sheets._ARM * 0.15
     test.pose[:, 1] = [0, 0, 0.02, *up]
     predicted = predicted._replace(pose=np.array([[0, 0, 0.02, *up], [0, 0.04, 0.02, *up]]))
     figures.pose_sheet(tmp_path / "a.png", test, predicted, np.array([0, 1]), size=(0.15, 0.15), **SCENE)
