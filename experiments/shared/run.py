@@ -271,6 +271,7 @@ def train_model(
     targets: Literal["all", "own"],
     own: Extensions = NONE,
     progress: Callable[[int, int, dict[str, float]], None] | None = None,
+    validation: training.Arrays | None = None,
 ) -> None:
     """Train a model in a folder, or continue an interrupted training. Without `progress`, a bar is shown."""
     with Bar() as bar:
@@ -292,4 +293,5 @@ def train_model(
             notes=own.notes,
             progress=progress or show,
             log=None if own.log is None else own.log(job.name),
+            validation=validation,
         )

@@ -1,0 +1,187 @@
+"""The paper's Table 1: four models of three scenarios at two time scales, and ours, with a verdict on its two claims.
+
+    python -m experiments.table1                    # about two hours on two CPU cores, can be stopped and started again
+    python -m experiments.table1 --seeds 0          # one seed, in a third of the time. More seeds may follow
+    python -m experiments.table1 --preset smoke     # about three minutes, for tests
+    python -m experiments.table1 --preset paper     # the paper's data size and training schedule: days, a GPU helps
+
+The results go to `runs/table1/`: `table1.md`, `claims.md`, `metrics.json` and figures. See `docs/experiments.md` for
+the files and the options. Every field of the configuration is an option too: `--perturbed.num-objects 100`.
+"""
+
+import dataclasses
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+import sts_jax as sts
+from experiments.shared import cells, claims, run
+from experiments.shared import config as common
+from experiments.shared.cells import Config
+from experiments.shared.evaluate import record, stale
+from experiments.shared.terminal import on_one_line, say
+from sts_jax import dataset, physics, storage
+from sts_jax.training import TrainConfig
+
+COLLECTION = dataset.Collection(num_objects=200, num_per_object=2, shares=(0.7, 0.1, 0.2), seed=2)
+DEFAULT = Config(
+    freefall=dataclasses.replace(COLLECTION, scenario=physics.Freefall()),
+    inclined=dataclasses.replace(COLLECTION, scenario=physics.Inclined()),
+    perturbed=dataclasses.replace(COLLECTION, scenario=physics.Perturbed(), categories=("bottle",)),
+    # All cells make the same number of steps with batches of the same size.
+    training=dataclasses.replace(common.TRAINING, steps=250, checkpoint_every=50),
+    state_training=dataclasses.replace(common.STATE_TRAINING, steps=250, warmup=50, checkpoint_every=50),
+)
+
+
+def _smoke(scenario: physics.Scenario, categories: tuple[str, ...] = COLLECTION.categories) -> dataset.Collection:
+    return dataset.Collection(
+        scenario, categories, num_objects=12, num_per_object=1, objects_per_shard=12, shares=(0.5, 0.25, 0.25)
+    )
+
+
+SMOKE = dataclasses.replace(
+    DEFAULT,
+    freefall=_smoke(physics.Freefall(frames=12)),
+    inclined=_smoke(physics.Inclined(frames=6)),
+    perturbed=_smoke(physics.Perturbed(frames=6), ("bottle",)),
+    training=dataclasses.replace(DEFAULT.training, steps=2, batch_size=4, log_every=1, checkpoint_every=1),
+    state_training=dataclasses.replace(
+        DEFAULT.state_training, steps=2, warmup=0, batch_size=4, log_every=1, checkpoint_every=1
+    ),
+    seeds=(0,),
+    num_validated=1,
+    moments=(0, 2),
+    rerolls=2,
+    num_rerolled=3,
+)
+
+
+def _paper(collection: dataset.Collection, num_objects: int) -> dataset.Collection:
+    return dataclasses.replace(collection, num_objects=num_objects, num_per_object=5, crop=True, objects_per_shard=20)
+
+
+PAPER = dataclasses.replace(
+    DEFAULT,
+    freefall=_paper(DEFAULT.freefall, 340),  # 1,700 trajectories
+    inclined=_paper(DEFAULT.inclined, 480),  # 2,400
+    perturbed=_paper(DEFAULT.perturbed, 500),  # 2,500
+    training=TrainConfig(epochs=200, batch_size=64, learning_rate=1e-3),
+    models=tuple(cells.PAPER),  # the state-space model needs images of the whole pad
+    targets="own",
+    rotation="quaternion",
+    mask_blank_touch=False,
+    encode_condition=True,
+    prior="conditional",
+    split="trajectory",
+)
+PRESETS = {"smoke": SMOKE, "default": DEFAULT, "paper": PAPER}
+
+
+@dataclasses.dataclass(frozen=True)
+class Args:
+    """Options of the command line."""
+
+    workdir: Path  # folder for the results
+    # configuration of the preset. Each of its fields is an option
+    config: Annotated[Config, tyro.conf.arg(name="")]
+    preset: Literal["smoke", "default", "paper"] = "default"  # set of default values for the options
+    debug: bool = False  # show the traceback of every error
+
+
+def main(config: Config, workdir: Path) -> None:
+    """Collect the datasets, train and score all cells, and write the tables, the claims and the figures."""
+    cells.check(config)
+    sensor, todo = sts.Sensor(), list(cells.cells(config))
+    left = {cell: cells.estimated_s(config, cell) for cell in todo}
+    collecting = sum(cells.estimated_collecting_s(config, name) for name in config.scenarios)
+    say(
+        f"{len(todo)} models, about {_minutes(sum(left.values()) + collecting)} if nothing is done yet: "
+        f"{_minutes(collecting)} for the datasets, {_minutes(sum(left.values()))} for the models"
+    )
+    with storage.lock(workdir, finished=True):
+        storage.claim(workdir / "config.json", config.claimed)
+        scenes = {name: cells.scene(config, name, sensor, workdir) for name in config.scenarios}
+        references = {name: cells.references(config, sensor, workdir, scene) for name, scene in scenes.items()}
+        spent, expected = 0.0, 0.0
+        for number, cell in enumerate(todo, 1):
+            start = time.monotonic()
+            if cells.compute(config, sensor, workdir, scenes[cell.scenario], cell):
+                spent, expected = spent + time.monotonic() - start, expected + left[cell]
+                rest = sum(left[other] for other in todo[number:]) * spent / expected
+                say(f"[{number}/{len(todo)}] {cell.name}: {time.monotonic() - start:.0f} s, {_minutes(rest)} left")
+            following = todo[number] if number < len(todo) else None
+            if following is None or following[0] != cell[0]:  # a scenario of a seed is complete
+                write(config, workdir, scenes, references)
+        print(ending(workdir))
+
+
+def write(
+    config: Config,
+    workdir: Path,
+    scenes: dict[str, cells.Scene],
+    references: dict[str, cells.Scores],
+) -> None:
+    """Write the tables, the claims and the metrics from the scores of the seeds that are complete."""
+    results, checksums = [], {}
+    for name, scene in scenes.items():
+        complete, scores = [], {}
+        for seed in config.seeds:
+            wanted = list(cells.cells(dataclasses.replace(config, seeds=(seed,), scenarios=(name,))))
+            paths = {cell: workdir / "scores" / f"{cell.name}.npz" for cell in wanted}
+            if all(path.exists() for path in paths.values()):
+                complete.append(seed)
+                scores |= {cell: storage.read_arrays(path, f"delete {path}") for cell, path in paths.items()}
+                checksums |= storage.checksums(workdir, [p.relative_to(workdir).as_posix() for p in paths.values()])
+        if complete:
+            results.append(claims.Results(name, scene.test.object, tuple(complete), scores, references[name]))
+    if not results or stale(workdir, "results", checksums) is None:
+        return
+    numbers = [claims.summarise(one) for one in results]
+    title = f"Table 1, {workdir.name}: the last frame from the first one, held out by {config.split}"
+    texts = {
+        "table1.md": claims.table(numbers, title=title, notes=notes(config)),
+        "claims.md": claims.verdicts(numbers),
+    }
+    for file, text in texts.items():
+        storage.write_bytes(workdir / file, text.encode())
+    storage.write_json(
+        workdir / "metrics.json", {"split": config.split, "scenarios": [dataclasses.asdict(one) for one in numbers]}
+    )
+    record(workdir, "results", checksums, [workdir / file for file in (*texts, "metrics.json")])
+
+
+def notes(config: Config) -> list[str]:
+    """What the cells have in common, for the table."""
+    lines = []
+    for family, schedule in (
+        ("the paper's models", config.training),
+        ("the state-space models", config.state_training),
+    ):
+        length = f"{schedule.epochs} epochs" if schedule.steps is None else f"{schedule.steps} gradient steps"
+        lines.append(f"Every cell of {family}: {length}, batch {schedule.batch_size}.")
+    return lines
+
+
+def ending(workdir: Path) -> str:
+    """What the terminal shows at the end: the verdicts, and where the results are."""
+    lines = [line for line in (workdir / "claims.md").read_text().splitlines() if line.startswith(("## ", "- "))]
+    return "\n".join([*lines, f"table:  {workdir / 'table1.md'}", f"claims: {workdir / 'claims.md'}"])
+
+
+def _minutes(seconds: float) -> str:
+    minutes = seconds / 60
+    if minutes >= 2 * 24 * 60:
+        return f"{minutes / 60 / 24:.0f} days"
+    return f"{minutes:.0f} min" if minutes < 120 else f"{minutes / 60:.1f} h"
+
+
+if __name__ == "__main__":
+    with on_one_line(debug="debug" in run.options(sys.argv[1:])):
+        default = Args(Path("runs/table1"), run.chosen_preset(PRESETS, sys.argv[1:]))
+        args = tyro.cli(Args, default=default, description=__doc__, config=(tyro.conf.AvoidSubcommands,))
+        sts.enable_compilation_cache()
+        main(args.config, args.workdir)
