@@ -2,9 +2,9 @@
 
     python -m benchmarks.table1 runs/table1     # about five minutes on two CPU cores
 
-The command predicts the last frames of the held-out trajectories with the stored models, computes the cross-entropies in
-float64, and compares them with `metrics.json`. Without --cells it takes a final-step and a multi-step model of the paper,
-and a state-space model.
+The command predicts the last frames of the held-out trajectories with the stored models, computes the cross-entropies
+in float64, and compares them with `metrics.json`. Without --cells it takes a final-step and a multi-step model of the
+paper, and a state-space model.
 """
 
 import dataclasses
@@ -67,11 +67,7 @@ def recomputed(folder: Path, test: dataset.Pairs) -> dict[str, float]:
             out = predictor.rollout(given, int(last - first) // predictor.stride, condition=condition)
             images = {name: None if (x := getattr(out, name)) is None else np.asarray(x)[:, -1] for name in STREAMS}
         else:
-            out = (
-                predictor(**given, condition=condition)
-                if given
-                else predictor.prior((len(part.object),), condition=condition)
-            )
+            out = predictor(**given, condition=condition) if given else predictor.prior((len(part.object),))
             images = {name: getattr(out, name) for name in STREAMS}
         for stream, image in images.items():
             if image is not None:
@@ -90,12 +86,9 @@ def _one_of_each_kind(metrics: dict[str, Any]) -> list[str]:
         for row in one["rows"]
         if row["bce_of_seed"] and row["side"]["model"] not in ("constant", "copy", "ceiling")
     ]
-    kinds = ("vae-final", "vae-step", "statespace")
-    found = {}
-    for name in names:
-        kind = "statespace" if "statespace" in name else "vae-step" if "-step-" in name else "vae-final"
-        found.setdefault(kind, name)
-    return [found[kind] for kind in kinds if kind in found]
+    kinds = [("statespace" in name, "-step-" in name) for name in names]
+    wanted = [(False, False), (False, True), (True, False)]
+    return [names[kinds.index(kind)] for kind in wanted if kind in kinds]
 
 
 def _stored(
