@@ -12,19 +12,25 @@ the files and the options. Every field of the configuration is an option too: `-
 import dataclasses
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
+import numpy as np
 import tyro
 
 import sts_jax as sts
-from experiments.shared import cells, claims, run
+from experiments.shared import cells, claims, evaluate, run
 from experiments.shared import config as common
-from experiments.shared.cells import Config
-from experiments.shared.evaluate import record, stale
+from experiments.shared.cells import NAMES, Config
 from experiments.shared.terminal import on_one_line, say
-from sts_jax import dataset, physics, storage
+from sts_jax import dataset, evaluation, physics, storage
+from sts_jax.evaluation import figures
 from sts_jax.training import TrainConfig
+
+SHOWN = 24  # held-out trajectories in the largest figures
+SHEETS = ("mvae", "statespace")  # models whose predictions and roll-outs are drawn
+CROSSED = ("mvae-without-pose", "statespace")  # models that predict one stream from the other one
 
 COLLECTION = dataset.Collection(num_objects=200, num_per_object=2, shares=(0.7, 0.1, 0.2), seed=2)
 DEFAULT = Config(
@@ -116,6 +122,7 @@ def main(config: Config, workdir: Path) -> None:
             following = todo[number] if number < len(todo) else None
             if following is None or following[0] != cell[0]:  # a scenario of a seed is complete
                 write(config, workdir, scenes, references)
+        draw(config, workdir, sensor, scenes)
         print(ending(workdir))
 
 
@@ -138,7 +145,7 @@ def write(
                 checksums |= storage.checksums(workdir, [p.relative_to(workdir).as_posix() for p in paths.values()])
         if complete:
             results.append(claims.Results(name, scene.test.object, tuple(complete), scores, references[name]))
-    if not results or stale(workdir, "results", checksums) is None:
+    if not results or evaluate.stale(workdir, "results", checksums) is None:
         return
     numbers = [claims.summarise(one) for one in results]
     title = f"Table 1, {workdir.name}: the last frame from the first one, held out by {config.split}"
@@ -151,7 +158,85 @@ def write(
     storage.write_json(
         workdir / "metrics.json", {"split": config.split, "scenarios": [dataclasses.asdict(one) for one in numbers]}
     )
-    record(workdir, "results", checksums, [workdir / file for file in (*texts, "metrics.json")])
+    evaluate.record(workdir, "results", checksums, [workdir / file for file in (*texts, "metrics.json")])
+
+
+def draw(config: Config, workdir: Path, sensor: sts.Sensor, scenes: dict[str, cells.Scene]) -> None:
+    """Draw the figures and write the probes of the models of the first seed, unless they are there already."""
+    models = list(cells.cells(dataclasses.replace(config, seeds=config.seeds[:1])))
+    checksums = {c.name: evaluate.identity(workdir / "models" / c.name) for c in models} | {"figures": str(SHOWN)}
+    if evaluate.stale(workdir, "figures", checksums) is None:
+        return
+    files, texts = [], []
+    for number, (name, scene) in enumerate(scenes.items()):
+        say(f"figures: {number}/{len(scenes)} {name}")
+        own = [c for c in models if c.scenario == name]
+        final, step = (
+            {c.model: sts.Predictor.load(workdir / "models" / c.name) for c in own if c.scale == scale}
+            for scale in ("final", "step")
+        )
+        files += draw_scene(workdir / "figures" / name, sensor, scene, final, step)
+        if "mvae" in final:
+            parts = {"train": scene.train, "validation": scene.validation, "test": scene.test}
+            found = evaluation.probe(final["mvae"], scene.data, parts, dataset.class_names(scene.collection))
+            texts.append(evaluation.probes_table(found, title=f"{name}: {NAMES['mvae']}, final-step"))
+    storage.write_bytes(workdir / "probes.md", "\n".join(texts).encode())
+    evaluate.record(workdir, "figures", checksums, [*files, workdir / "probes.md"])
+
+
+def draw_scene(
+    folder: Path,
+    sensor: sts.Sensor,
+    scene: cells.Scene,
+    final: Mapping[str, sts.Predictor],
+    step: Mapping[str, sts.Predictor],
+) -> list[Path]:
+    """Draw held-out trajectories of a scenario with its final-step and multi-step models. Returns the files."""
+    scenario, names, drawn = scene.collection.scenario, dataset.class_names(scene.collection), []
+    test = scene.test.take(figures.one_of_each(scene.test, names, SHOWN))
+    every = np.arange(len(test.object))
+    look: dict[str, Any] = {"scenario": scenario, "names": names}
+    width, height = (float(side) for side in sensor.gel.size)
+
+    def path(stem: str) -> Path:
+        drawn.append(folder / f"{stem}.png")
+        return drawn[-1]
+
+    ends = {model: evaluation.predict(p, p.modalities, test, scenario) for model, p in final.items()}
+    bodies = dataset.make_bodies(scene.collection, test.object)
+    some = every[: SHOWN // 3]
+    for model in (model for model in SHEETS if model in ends):
+        for stem, items in ((model, some), (f"{model}-large", every)):
+            outlines, title = [bodies[i] for i in items], f"{scene.name}: {NAMES[model]}, the last frame from the first"
+            more = {**look, "size": (width, height), "title": title, "bodies": outlines}
+            figures.pose_sheet(path(f"predictions-{stem}"), test, ends[model], items, **more)
+    papers = {NAMES[model]: ends[model] for model in cells.PAPER if model in ends}
+    if papers:
+        title = f"{scene.name}: the paper's models, the last frame from the first one"
+        figures.models_sheet(path("models"), test, papers, some, **look, title=title)
+    for model, predictor in final.items():
+        if model in CROSSED and {"visual", "tactile"} <= set(predictor.modalities):
+            sides = [evaluation.predict(predictor, (name,), test, scenario) for name in ("tactile", "visual")]
+            title = f"{scene.name}: {NAMES[model]}, each stream from the other one"
+            figures.crossed_sheet(path(f"crossed-{model}"), test, *sides, some, **look, title=title)
+    time, curves = scene.data.trajectory["time"][test.trajectory[0]], {}
+    for model in (model for model in SHEETS if model in step):
+        stride = step[model].stride or 1
+        times = np.arange(stride, len(time), stride)
+        rolled = evaluation.rollout(step[model], step[model].modalities, test, scenario, steps=len(times))
+        strip, title = scene.data.strip(int(test.trajectory[0])), f"{scene.name}: {NAMES[model]}, rolled out"
+        figures.rollout_strip(
+            path(f"rollout-{model}"), time, strip, rolled, 0, stride=stride, direct=ends.get(model), title=title
+        )
+        truths = [scene.data.pairs(test.trajectory, frames=(0, int(t))) for t in times]
+        curves[f"{NAMES[model]}, rolled out"] = evaluation.error_curve(time[times], zip(rolled, truths, strict=True))
+        copies = ((evaluation.Predicted(x.visual[:, 0], x.tactile[:, 0], x.pose[:, 0]), x) for x in truths)
+        curves["copy of the input"] = evaluation.error_curve(time[times], copies)
+        if model in ends:
+            curves[f"{NAMES[model]}, final-step"] = evaluation.error_curve(time[-1:], [(ends[model], test)])
+    if curves:
+        figures.error_curves(path("errors"), curves, test.object, title=f"{scene.name}: errors over time")
+    return drawn
 
 
 def notes(config: Config) -> list[str]:
