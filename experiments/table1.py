@@ -29,6 +29,7 @@ from sts_jax.evaluation import figures
 from sts_jax.training import TrainConfig
 
 SHOWN = 24  # held-out trajectories in the largest figures
+COURSES = 4  # sampled courses of a state-space model whose mean images are drawn
 SHEETS = ("mvae", "statespace")  # models whose predictions and roll-outs are drawn
 CROSSED = ("mvae-without-pose", "statespace")  # models that predict one stream from the other one
 
@@ -60,6 +61,7 @@ SMOKE = dataclasses.replace(
     ),
     seeds=(0,),
     num_validated=1,
+    num_samples=2,
     moments=(0, 2),
     rerolls=2,
     num_rerolled=3,
@@ -219,23 +221,26 @@ def draw_scene(
             sides = [evaluation.predict(predictor, (name,), test, scenario) for name in ("tactile", "visual")]
             title = f"{scene.name}: {NAMES[model]}, each stream from the other one"
             figures.crossed_sheet(path(f"crossed-{model}"), test, *sides, some, **look, title=title)
-    time, curves = scene.data.trajectory["time"][test.trajectory[0]], {}
+    few, time, curves = test.take(some), scene.data.trajectory["time"][test.trajectory[0]], {}
     for model in (model for model in SHEETS if model in step):
         stride = step[model].stride or 1
         times = np.arange(stride, len(time), stride)
-        rolled = evaluation.rollout(step[model], step[model].modalities, test, scenario, steps=len(times))
+        more = {"steps": len(times), "num_samples": COURSES if model in cells.STATE else 0}
+        rolled = evaluation.rollout(step[model], step[model].modalities, few, scenario, **more)
         strip, title = scene.data.strip(int(test.trajectory[0])), f"{scene.name}: {NAMES[model]}, rolled out"
         figures.rollout_strip(
             path(f"rollout-{model}"), time, strip, rolled, 0, stride=stride, direct=ends.get(model), title=title
         )
-        truths = [scene.data.pairs(test.trajectory, frames=(0, int(t))) for t in times]
+        truths = [scene.data.pairs(few.trajectory, frames=(0, int(t))) for t in times]
         curves[f"{NAMES[model]}, rolled out"] = evaluation.error_curve(time[times], zip(rolled, truths, strict=True))
         copies = ((evaluation.Predicted(x.visual[:, 0], x.tactile[:, 0], x.pose[:, 0]), x) for x in truths)
         curves["copy of the input"] = evaluation.error_curve(time[times], copies)
         if model in ends:
-            curves[f"{NAMES[model]}, final-step"] = evaluation.error_curve(time[-1:], [(ends[model], test)])
+            curves[f"{NAMES[model]}, final-step"] = evaluation.error_curve(
+                time[-1:], [(evaluation.first(ends[model], len(few.object)), few)]
+            )
     if curves:
-        figures.error_curves(path("errors"), curves, test.object, title=f"{scene.name}: errors over time")
+        figures.error_curves(path("errors"), curves, few.object, title=f"{scene.name}: errors over time")
     return drawn
 
 

@@ -97,6 +97,7 @@ class Config:
     in_memory: bool = True  # read the frames of one-step trainings into memory. False: from the disk, batch by batch
     num_validated: int = 4  # trajectories whose frames give the validation loss of the paper's one-step models
     moments: tuple[int, ...] = (0, 4, 12, 30)  # frames from which the one-step error is measured, besides the roll-out
+    num_samples: int = 16  # samples of each prediction of a state-space model, whose mean image is scored
     rerolls: int = 12  # simulations of each held-out start, whose mean is the ceiling
     num_rerolled: int = 60  # held-out starts that are re-rolled, from the first one on
 
@@ -157,7 +158,7 @@ def check(config: Config) -> None:
             )
     if min(config.moments, default=0) < 0:
         raise ValueError(f"moments must be >= 0, got {config.moments}")
-    for name in ("num_validated", "rerolls", "num_rerolled"):
+    for name in ("num_validated", "num_samples", "rerolls", "num_rerolled"):
         if getattr(config, name) < 1:
             raise ValueError(f"{name} must be >= 1, got {getattr(config, name)}")
     for seed in config.seeds:
@@ -259,7 +260,12 @@ def compute(config: Config, sensor: sts.Sensor, workdir: Path, scene: Scene, cel
 def inputs(config: Config, workdir: Path, scene: Scene, cell: Cell) -> dict[str, str]:
     """The checksums on which the scores of a cell depend."""
     folder = workdir / "models" / cell.name
-    how = {"split": config.split, "moments": config.moments, "metrics": [metric.name for metric in SCORED]}
+    how = {
+        "split": config.split,
+        "moments": config.moments,
+        "samples": config.num_samples,
+        "metrics": [metric.name for metric in SCORED],
+    }
     models = {f"models/{cell.name}/{name}".rstrip("/"): identity(folder / name) for name in ("", "best")}
     return {"dataset": scene.data.identity, **models, "the evaluation": storage.digest(how)}
 
@@ -291,29 +297,39 @@ def _paper(config: Config, sensor: sts.Sensor, scene: Scene, cell: Cell) -> tupl
 
 
 def _state(config: Config, sensor: sts.Sensor, scene: Scene, cell: Cell) -> tuple[Job, Arrays]:
-    collection = scene.collection
-    plain = dataclasses.replace(_as_experiment(config, collection).preprocessing, rotation="matrix")
-    side = collection.resolution[0]
-    model, view = training.state_model(scene.train, sensor, collection.scenario, plain, scene.empty, image_size=side)
+    scenario, side = scene.collection.scenario, scene.collection.resolution[0]
+    plain = dataclasses.replace(_as_experiment(config, scene.collection).preprocessing, rotation="matrix")
+    stride = config.stride if cell.scale == "step" else 0
+    model, view = training.state_model(
+        scene.train, sensor, scenario, plain, scene.empty, image_size=side, stride=stride
+    )
     model = dataclasses.replace(model, inputs=tuple(name for name in model.inputs if name in STATE[cell.model]))
-    arrays, held = (
-        training.state_arrays(pairs, model, collection.scenario, view, scene.empty)
-        for pairs in (scene.train, scene.validation)
+    train = _with_frames_between(scene) if stride else scene.train
+    arrays, validation = (
+        training.state_arrays(pairs, model, scenario, view, scene.empty, data=scene.data)
+        for pairs in (train, scene.validation)
     )
     schedule = dataclasses.replace(config.state_training, seed=cell.seed)
-    return Job(cell.name, schedule, model, arrays, view, scene.empty), held
+    return Job(cell.name, schedule, model, arrays, view, scene.empty), validation
+
+
+def _with_frames_between(scene: Scene) -> dataset.Pairs:
+    """Each training trajectory with its last frame and with a random one, so that a decoder learns all moments."""
+    rows, last = scene.rows["train"], scene.collection.scenario.frames - 1
+    random = np.random.default_rng(0).integers(1, last + 1, len(rows))
+    return scene.data.pairs(np.tile(rows, 2), frames=(0, np.concatenate([np.full(len(rows), last), random])))
 
 
 def score(config: Config, scene: Scene, cell: Cell, folder: Path) -> Scores:
     """The scores of both weights of a cell, for all its inputs and for some of them, and the errors of one step."""
     scores: Scores = {}
-    scenario = scene.collection.scenario
+    scenario, num_samples = scene.collection.scenario, config.num_samples if cell.model in STATE else 0
     with Bar() as bar:
         for weights, place in zip(WEIGHTS, (folder, folder / "best"), strict=True):
             predictor = sts.Predictor.load(place)
 
             def predict(pairs: dataset.Pairs, subset: tuple[str, ...], predictor: sts.Predictor = predictor) -> Scores:
-                out = evaluation.predict(predictor, subset, pairs, scenario)
+                out = evaluation.predict(predictor, subset, pairs, scenario, num_samples=num_samples)
                 return evaluation.score(out, pairs, metrics=SCORED)
 
             every = asked(cell, predictor.modalities)
@@ -321,7 +337,9 @@ def score(config: Config, scene: Scene, cell: Cell, folder: Path) -> Scores:
                 bar(f"score {cell.name}", number, len(every), f"{weights}, {given}")
                 scores |= _named(f"{weights}/{given}", predict(scene.test, subset))
             if cell.scale == "step":
-                steps = [predict(pairs, predictor.modalities) for pairs in scene.moments.values()]
+                # A state-space model infers the state from frame 0, in which the object is at rest.
+                moments = [t for t in scene.moments if t == 0 or cell.model not in STATE]
+                steps = [predict(scene.moments[t], predictor.modalities) for t in moments]
                 scores |= _named(f"{weights}/{ONE_STEP}", _summed(steps))
     return scores
 
