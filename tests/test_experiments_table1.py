@@ -11,7 +11,7 @@ from experiments import table1
 from experiments.shared import cells, claims
 from experiments.shared.cells import Cell
 from experiments.shared.claims import Comparison, Estimate, Results, Side
-from sts_jax import storage
+from sts_jax import evaluation, storage, training
 
 # Table 1 of the paper, row by row
 PAPER = """
@@ -278,3 +278,38 @@ def test_no_held_out_object_is_in_a_training_or_validation_batch(workdir):
             found = {known[image] for image in images if image != scene.empty["visual"].tobytes()}
             assert found
             assert not found & held_out
+
+
+def discs(rng, count, side=32):
+    """Pairs of images of a disc that moves by a third of the image, uint8 (count, 2, side, side, 3)."""
+    centre = rng.uniform(0.2 * side, 0.5 * side, (count, 1, 2)) + np.array([[0, 0], [0.3 * side, 0.3 * side]])
+    row, column = np.indices((side, side))
+    far = np.hypot(row - centre[..., 0, None, None], column - centre[..., 1, None, None])
+    return np.repeat(np.where(far < 5, 40, 180)[..., None], 3, -1).astype(np.uint8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shuffled", [False, True])
+def test_shuffled_targets_give_no_skill(shuffled, tmp_path):
+    rng = np.random.default_rng(0)
+    train, test, blank = discs(rng, 512), discs(rng, 64), np.full((32, 32, 3), 180, np.uint8)
+    if shuffled:
+        train[:, 1] = train[rng.permutation(len(train)), 1]
+    arrays, view = training.image_arrays(train, train, ("visual",), training.Preprocessing((32, 32)), blank)
+    schedule = training.TrainConfig(steps=300, batch_size=16, learning_rate=2e-3, schedule="cosine", encoder_epsilon=3)
+    training.save_blank(tmp_path, blank, blank)
+    training.train(
+        schedule,
+        training.paper_model(("visual",), view),
+        arrays,
+        workdir=tmp_path,
+        preprocessing=dataclasses.asdict(view),
+    )
+    predicted = np.asarray(table1.sts.Predictor.load(tmp_path)(visual=test[:, 0] / 255).visual)
+    truth, constant = test[:, 1] / 255, np.broadcast_to(train[:, 1].mean(0) / 255, predicted.shape)
+    errors, reference = (evaluation.metrics.image_error(x, truth).excess for x in (predicted, constant))
+    found = claims.ratio(errors[None], reference[None], claims.resample(np.arange(64), 1))
+    if shuffled:
+        assert abs(1 - found.value) < 0.1
+    else:
+        assert 1 - found.value > 0.5
