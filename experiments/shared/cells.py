@@ -291,7 +291,7 @@ def _paper(config: Config, sensor: sts.Sensor, scene: Scene, cell: Cell) -> tupl
             in_memory=config.in_memory,
         )
         held, _ = training.step_arrays(scene.data, few, modalities, plain, blank, stride=config.stride)
-    model = training.paper_model(modalities, view, encode_condition=config.encode_condition, prior=config.prior)
+    model = training.paper_model(modalities, view)
     schedule = dataclasses.replace(config.training, seed=cell.seed)
     return Job(cell.name, schedule, model, arrays, view, scene.empty), held
 
@@ -330,7 +330,7 @@ def score(config: Config, scene: Scene, cell: Cell, folder: Path) -> Scores:
 
             def predict(pairs: dataset.Pairs, subset: tuple[str, ...], predictor: sts.Predictor = predictor) -> Scores:
                 out = evaluation.predict(predictor, subset, pairs, scenario, num_samples=num_samples)
-                return evaluation.score(out, pairs, metrics=SCORED)
+                return _errors(scene, out, pairs)
 
             every = asked(cell, predictor.modalities)
             for number, (given, subset) in enumerate(every.items()):
@@ -342,6 +342,10 @@ def score(config: Config, scene: Scene, cell: Cell, folder: Path) -> Scores:
                 steps = [predict(scene.moments[t], predictor.modalities) for t in moments]
                 scores |= _named(f"{weights}/{ONE_STEP}", _summed(steps))
     return scores
+
+
+def _errors(scene: Scene, predicted: evaluation.Predicted, test: dataset.Pairs) -> Scores:
+    return evaluation.score(predicted, test, outcomes=scene.collection.scenario.outcomes, metrics=SCORED)
 
 
 def _named(name: str, errors: Scores) -> Scores:
@@ -379,14 +383,12 @@ def references(config: Config, sensor: sts.Sensor, workdir: Path, scene: Scene) 
         key = jax.random.key(SEED)
         rows["ceiling"] = evaluation.ceiling(
             scene.collection, sensor, few, config.rerolls, key, progress=lambda done: bar("re-roll", done, total)
-        )._replace(outcome_probability=None)
+        )
     scores: Scores = {}
     for name, predicted in rows.items():
-        scores |= _named(f"{name}/{ALL}", evaluation.score(predicted, scene.test, metrics=SCORED))
-    copies = [
-        evaluation.score(evaluation.Predicted(pairs.visual[:, 0], pairs.tactile[:, 0]), pairs, metrics=SCORED)
-        for pairs in scene.moments.values()
-    ]
+        scores |= _named(f"{name}/{ALL}", _errors(scene, predicted, scene.test))
+    steps = scene.moments.values()
+    copies = [_errors(scene, evaluation.Predicted(x.visual[:, 0], x.tactile[:, 0]), x) for x in steps]
     scores |= _named(f"copy/{ONE_STEP}", _summed(copies))
     storage.write_arrays(path, scores)
     record(workdir, part, checksums, [path])
