@@ -78,7 +78,7 @@ class Predictor:
         self._names = config.names if isinstance(config, mvae.Config) else MODALITIES
         if isinstance(config, mvae.Config):
             for modality in config.modalities:
-                self._kinds.setdefault(modality.name, modality.kind)
+                self._kinds.setdefault(modality.name, "image" if modality.kind == "image" else "vector")
                 self._shapes.setdefault(modality.name, modality.shape)
             # A vector without a scale was trained on its own numbers.
             vectors = [name for name, kind in self._kinds.items() if kind == "vector"]

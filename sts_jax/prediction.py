@@ -34,7 +34,7 @@ class Prediction(NamedTuple):
     samples: "Prediction | None" = None
     # Probability of each outcome, in the order of `Predictor.outcomes`. None for an `mvae` model.
     outcome_probability: Float[Array, "*n outcomes"] | None = None
-    # Further modalities (`dataset.Measurement`) by name: numbers in SI units, or images in [0, 1].
+    # Further modalities (`dataset.Measurement`) by name: numbers in SI units, images in [0, 1], or class probabilities.
     measurements: dict[str, Float[Array, "..."]] | None = None
 
     def __repr__(self) -> str:
@@ -73,20 +73,19 @@ def predict(
         lead: Leading axes *n. Without inputs, the prediction is made from the prior.
     """
     flat, counts = _flat(preprocessing, inputs, present, lead, blank)
-    if flat:
-        posterior = mvae.infer(graphdef, state, flat, present=counts)
-    else:
-        nothing = jnp.zeros((math.prod(lead), nnx.merge(graphdef, state).config.latent))
-        posterior = mvae.Gaussian(nothing, nothing)
     if condition is not None:
         condition = preprocessing.encode_condition(condition).reshape(-1, condition.shape[-1])
+    if flat:
+        posterior = mvae.infer(graphdef, state, flat, present=counts, condition=condition)
+    else:
+        posterior = mvae.prior(graphdef, state, math.prod(lead), condition=condition)
+    config = nnx.merge(graphdef, state).config
 
     def decode(z: Float[Array, "... latent"], shape: tuple[int, ...]) -> Prediction:
         wide = None if condition is None else jnp.broadcast_to(condition, (*z.shape[:-1], condition.shape[-1]))
         out = mvae.decode(graphdef, state, z, condition=wide)
         out = {name: value.reshape(*shape, *value.shape[z.ndim - 1 :]) for name, value in out.items()}
-        values = {name: preprocessing.decode(name, value) for name, value in out.items()}
-        return _named(values, *(x.reshape(*lead, -1) for x in posterior))
+        return _named(_values(config, preprocessing, out), *(x.reshape(*lead, -1) for x in posterior))
 
     result = decode(posterior.mean, lead)
     if num_samples and key is not None:
@@ -96,6 +95,15 @@ def predict(
         z = posterior.mean[None] + jnp.exp(0.5 * posterior.log_var)[None] * noise
         result = result._replace(samples=decode(z, (num_samples, *lead)))
     return result
+
+
+def _values(config: mvae.Config, preprocessing: training.Preprocessing, out: dict[str, Array]) -> dict[str, Array]:
+    """Decode the output of the networks: `Preprocessing.decode`, and the probabilities of categories."""
+    categories = {m.name for m in config.modalities if m.kind == "category"}
+    return {
+        name: jax.nn.softmax(value) if name in categories else preprocessing.decode(name, value)
+        for name, value in out.items()
+    }
 
 
 def _named(values: dict[str, Array], mean: Array, log_var: Array) -> Prediction:
@@ -162,13 +170,12 @@ def rollout(
 
     def advance(frame: _Frame, step: Int[Array, ""]) -> tuple[_Frame, _Frame | None]:
         flat, counts = _flat(preprocessing, frame.values, frame.present, (courses * items,), blank)
-        posterior = mvae.infer(graphdef, state, flat, present=counts)
-        z = posterior.mean + jnp.exp(0.5 * posterior.log_var) * noise(step)
         now = None
         if begin is not None:
             now = preprocessing.encode_condition(begin.at[:, -1].add(step * preprocessing.period))
-        out = mvae.decode(graphdef, state, z, condition=now)
-        values = {name: preprocessing.decode(name, value) for name, value in out.items()}
+        posterior = mvae.infer(graphdef, state, flat, present=counts, condition=now)
+        z = posterior.mean + jnp.exp(0.5 * posterior.log_var) * noise(step)
+        values = _values(config, preprocessing, mvae.decode(graphdef, state, z, condition=now))
         known = {name: jnp.full(courses * items, name not in preprocessing.absent) for name in values}
         new = _Frame(values, known, posterior)
         return new, None if last else new

@@ -68,6 +68,11 @@ def test_the_preset_paper_has_the_counts_of_the_paper(experiment, classes, traje
     assert (experiment.PAPER.targets, experiment.PAPER.splits) == ("own", ("trajectory", "object"))
     model = training.paper_model(config.MODELS["paper"]["mvae"], experiment.PAPER.preprocessing)
     assert [(m.weight, m.shape) for m in model.modalities] == [(1, (64, 64, 3)), (1, (64, 64, 3)), (1000, (7,))]
+    equation_10 = {"encode_condition": experiment.PAPER.encode_condition, "prior": experiment.PAPER.prior}
+    assert equation_10 == {"encode_condition": True, "prior": "conditional"}
+    model = training.paper_model(("visual",), experiment.PAPER.preprocessing, **equation_10)
+    depends = experiment is perturbed  # the only scenario with a condition
+    assert (model.encode_condition, model.prior == "conditional") == (depends, depends)
 
 
 def test_options_reach_the_experiment(tmp_path, monkeypatch):

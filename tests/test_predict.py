@@ -171,15 +171,21 @@ def test_an_input_that_was_absent_in_training_is_refused():
     assert predictor(visual=GIVEN["visual"]).tactile.shape == (2, SIDE, SIDE, 3)
 
 
-def test_a_condition_is_given_in_si_units():
+@pytest.mark.parametrize("options", [{}, {"encode_condition": True, "prior": "conditional"}])
+def test_a_condition_is_given_in_si_units(options):
     scale, image = (10.0, 10.0, 0.1), GIVEN["visual"]
-    predictor = untrained(dataclasses.replace(SMALL, condition=3), condition_scale=scale)
+    predictor = untrained(dataclasses.replace(SMALL, condition=3, **options), condition_scale=scale)
     model, wide = predictor.model, jnp.asarray(CONDITION / np.array(scale), jnp.float32)
     logits, _ = mvae.predict(model.graphdef, model.state, {"visual": jnp.asarray(image)}, condition=wide)
     np.testing.assert_allclose(
         predictor(visual=image, condition=CONDITION).visual, jax.nn.sigmoid(logits["visual"]), atol=1e-5
     )
-    assert np.ptp(predictor.prior((2,), condition=CONDITION).pose, axis=0).max() > 1e-3
+    prior = predictor.prior((2,), condition=CONDITION)
+    assert np.ptp(prior.pose, axis=0).max() > 1e-3
+    np.testing.assert_allclose(prior.mean, mvae.prior(model.graphdef, model.state, 2, condition=wide).mean, atol=1e-6)
+    ignored = predictor(visual=image, condition=CONDITION, present={"visual": np.zeros(2, bool)})
+    np.testing.assert_allclose(ignored.log_var, prior.log_var, atol=1e-6)
+    assert bool(np.any(prior.mean)) == bool(options)
     for wrong, message in ((None, r"condition has shape None, but .* needs \(2, 3\)"), (CONDITION * 1e3, "SI units")):
         with pytest.raises(ValueError, match=message):
             predictor(visual=image, condition=wrong)

@@ -69,6 +69,12 @@ class Config:
     # modalities that the paper's models learn to predict when only some modalities are given: all of them, or only
     # the given ones (own, as in the paper)
     targets: Literal["all", "own"] = "all"
+    # the condition of a scenario, such as a jerk, is always an input of the paper models' decoders. True: it is also an
+    # input of their encoders, as in the paper's equation (10)
+    encode_condition: bool = False
+    # prior of the paper's models: standard normal (as in the paper's code), or a Gaussian that depends on the condition
+    # (conditional, as in the paper's equation (10))
+    prior: Literal["standard", "conditional"] = "standard"
     rotation: Literal["matrix", "quaternion"] = "matrix"  # representation of rotations in the networks
     # leave out tactile images without contact as inputs. False: use these blank images, as in the paper
     mask_blank_touch: bool = True
@@ -216,6 +222,8 @@ def paper(collection: dataset.Collection, *, num_objects: int, num_per_object: i
         model="paper",
         steps=None,
         targets="own",
+        encode_condition=True,
+        prior="conditional",
         rotation="quaternion",
         mask_blank_touch=False,
         splits=("trajectory", "object"),

@@ -21,7 +21,10 @@ from sts_jax.training import TrainConfig
 Stage = Literal["collect", "train", "evaluate"]
 Preset = TypeVar("Preset")  # type of a configuration
 # Fields of the configuration that have no effect on the training of each kind of models
-WITHOUT_EFFECT = {"statespace": ("training", "steps", "targets"), "paper": ("state_training", "num_samples")}
+WITHOUT_EFFECT = {
+    "statespace": ("training", "steps", "targets", "encode_condition", "prior"),
+    "paper": ("state_training", "num_samples"),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -239,7 +242,13 @@ def jobs(
         schedule = config.training
         if config.steps is not None:
             schedule = dataclasses.replace(schedule, steps=config.steps[number])
-        networks = training.paper_model(modalities, preprocessing, measurements=further)
+        networks = training.paper_model(
+            modalities,
+            preprocessing,
+            measurements=further,
+            encode_condition=config.encode_condition,
+            prior=config.prior,
+        )
         yield Job(name, schedule, networks, arrays, preprocessing, empty)
 
 

@@ -1,7 +1,8 @@
 """The paper's encoders and decoders as Flax NNX modules.
 
 Images have shape `(batch, height, width, channel)`. Their encoders take values in [0, 1], and their decoders return
-logits. Vectors have shape `(batch, size)`. Their values are not limited.
+logits. Vectors have shape `(batch, size)`. Their values are not limited. Categories have shape `(batch, classes)`.
+Their encoders take the probabilities of the classes, one-hot if the class is known, and their decoders return logits.
 
 Source: the paper's supplement, "Network Architecture". The hidden widths are those of Wu and Goodman (2018).
 """
@@ -35,11 +36,12 @@ _FIRST_LOG_VAR = -4.0  # log variance of an active latent at initialisation
 
 @dataclass(frozen=True)
 class Modality:
-    """One quantity that a model receives as an input and predicts as an output: an image or a vector."""
+    """One quantity that a model receives as an input and predicts as an output: an image, a vector or a category."""
 
     name: str
-    kind: Literal["image", "vector"]
-    shape: tuple[int, ...]  # (height, width, channel), with sides >= 32 that are multiples of 8, or (size,)
+    kind: Literal["image", "vector", "category"]
+    # (height, width, channel), with sides >= 32 that are multiples of 8, or (size,), or (classes,)
+    shape: tuple[int, ...]
     weight: float = 1.0  # weight lambda of the reconstruction error (paper: 1 for images, 1000 for the pose)
     # For images: grey value, > 0 and < 1, of the predictions before training. The grey value of the background saves
     # many training steps.
@@ -50,10 +52,11 @@ class Modality:
             raise ValueError(f"modality {self.name!r}: start must be a grey value > 0 and < 1, got {self.start}")
         image = len(self.shape) == 3 and all(side >= 32 and side % 8 == 0 for side in self.shape[:2])
         vector = len(self.shape) == 1 and self.shape[0] > 0
-        if not (self.kind == "image" and image) and not (self.kind == "vector" and vector):
+        if not (self.kind == "image" and image) and not (self.kind in ("vector", "category") and vector):
             raise ValueError(
                 f"modality {self.name!r} must be an 'image' of shape (height, width, channel) with sides >= 32 that "
-                f"are multiples of 8, or a 'vector' of shape (size,), got {self.kind!r} of shape {self.shape}"
+                f"are multiples of 8, a 'vector' of shape (size,), or a 'category' of shape (classes,), got "
+                f"{self.kind!r} of shape {self.shape}"
             )
 
 
@@ -65,7 +68,11 @@ class Config:
     latent: int = 256  # components of the latent (paper)
     hidden: int = 512  # width between two fully connected layers (not in the paper)
     widths: tuple[int, ...] = (32, 64, 128, 256)  # channels after each convolution of an image encoder (paper)
-    condition: int = 0  # width of the condition, which is appended to the latent, 0 for none
+    condition: int = 0  # width of the condition c, which is appended to the latent, 0 for none
+    encode_condition: bool = False  # True: experts q(z | x, c), the condition is also an input of the encoders
+    # standard: p(z) = N(0, I). conditional: a Gaussian p(z | c) with a network of its own. The prior is both the prior
+    # expert of the product and the distribution that the loss measures the divergence from (paper, equation 10)
+    prior: Literal["standard", "conditional"] = "standard"
     momentum: float = 0.9  # weight of the old values in the running batch statistics, per step
 
     def __post_init__(self) -> None:
@@ -74,6 +81,13 @@ class Config:
             raise ValueError(f"modalities must have at least one name, and each once, got {names}")
         if len(self.widths) != len(_LAYERS):
             raise ValueError(f"widths must have {len(_LAYERS)} numbers, one per convolution, got {self.widths}")
+        if self.prior not in ("standard", "conditional"):
+            raise ValueError(f"prior must be 'standard' or 'conditional', got {self.prior!r}")
+        if not self.condition and (self.encode_condition or self.prior == "conditional"):
+            raise ValueError(
+                f"encode_condition={self.encode_condition} and prior={self.prior!r} need a condition, but condition=0: "
+                "give its width, or leave out both options"
+            )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -88,6 +102,19 @@ class _Linear(nnx.Module):
 
     def __call__(self, x: Array) -> Array:
         return x @ self.kernel[...] + self.bias[...][None]
+
+
+class _FromFeatures(_Linear):
+    """The first fully connected layer of an encoder. With `encode_condition`, the condition follows the features."""
+
+    def __init__(self, size: int, config: Config) -> None:
+        width = config.condition if config.encode_condition else 0
+        super().__init__(size + width, config.hidden)
+        if width:  # the few numbers of the condition count as much as all features
+            self.kernel[size:] = _spread((width, config.hidden), width)
+
+    def __call__(self, x: Array, condition: Array | None = None) -> Array:
+        return super().__call__(x if condition is None else jnp.concatenate([x, condition], axis=-1))
 
 
 class _ToLatent(_Linear):
@@ -159,13 +186,13 @@ class _ImageEncoder(nnx.Module):
             ]
         )
         self.norms = nnx.List([BatchNorm(c, momentum=config.momentum) for c in config.widths])
-        self.first = _Linear(math.prod(_core(modality)) * config.widths[-1], config.hidden)
+        self.first = _FromFeatures(math.prod(_core(modality)) * config.widths[-1], config)
         self.second = _ToLatent(config)
 
-    def __call__(self, x: Array, weights: Array | None) -> Gaussian:
+    def __call__(self, x: Array, weights: Array | None, condition: Array | None = None) -> Gaussian:
         for kernel, norm, (stride, padding) in zip(self.kernels, self.norms, _LAYERS, strict=True):
             x = jax.nn.swish(norm(conv(x, kernel[...], stride, padding), weights))
-        return _gaussian(self.second(jax.nn.swish(self.first(x.reshape(len(x), -1)))))
+        return _gaussian(self.second(jax.nn.swish(self.first(x.reshape(len(x), -1), condition))))
 
 
 class _ImageDecoder(nnx.Module):
@@ -199,12 +226,12 @@ class _VectorEncoder(nnx.Module):
     """Two fully connected layers."""
 
     def __init__(self, modality: Modality, config: Config) -> None:
-        self.first = _Linear(modality.shape[0], config.hidden)
+        self.first = _FromFeatures(modality.shape[0], config)
         self.second = _ToLatent(config)
 
-    def __call__(self, x: Array, weights: Array | None) -> Gaussian:
+    def __call__(self, x: Array, weights: Array | None, condition: Array | None = None) -> Gaussian:
         del weights
-        return _gaussian(self.second(jax.nn.swish(self.first(x))))
+        return _gaussian(self.second(jax.nn.swish(self.first(x, condition))))
 
 
 class _VectorDecoder(nnx.Module):
@@ -219,20 +246,36 @@ class _VectorDecoder(nnx.Module):
         return self.second(jax.nn.swish(self.first(z)))
 
 
+class _Prior(nnx.Module):
+    """The prior `p(z | c)`: two fully connected layers. Before training, it is close to the standard normal."""
+
+    def __init__(self, config: Config) -> None:
+        self.first = _Linear(config.condition, config.hidden)
+        self.second = _Linear(config.hidden, 2 * config.latent)
+        self.second.kernel[...] *= _QUIET
+
+    def __call__(self, condition: Array) -> Gaussian:
+        return _gaussian(self.second(jax.nn.swish(self.first(condition))))
+
+
 class MVAE(nnx.Module):
     """A multimodal variational autoencoder with one encoder and one decoder for each modality.
 
-    An encoder maps images in [0, 1] or vectors, `(batch, *shape)`, to the expert, `(batch, latent)`. A decoder maps
-    latents with the condition, `(batch, latent + condition)`, to predictions, `(batch, *shape)`, logits for images.
-    Their second argument has the weights of the samples in batch normalisation. None uses the running statistics.
+    An encoder maps images in [0, 1], vectors or probabilities of classes, `(batch, *shape)`, to the expert,
+    `(batch, latent)`. With `Config.encode_condition`, it also takes the condition. A decoder maps latents with the
+    condition, `(batch, latent + condition)`, to predictions, `(batch, *shape)`, logits for images and categories. The
+    second argument of both has the weights of the samples in batch normalisation. None uses the running statistics. The
+    network `prior` maps conditions to the prior. Only a model with a conditional prior has it.
     """
 
     def __init__(self, config: Config) -> None:
         self.config = config
-        encoders = {"image": _ImageEncoder, "vector": _VectorEncoder}
-        decoders = {"image": _ImageDecoder, "vector": _VectorDecoder}
+        encoders = {"image": _ImageEncoder, "vector": _VectorEncoder, "category": _VectorEncoder}
+        decoders = {"image": _ImageDecoder, "vector": _VectorDecoder, "category": _VectorDecoder}
         self.encoders = nnx.Dict({m.name: encoders[m.kind](m, config) for m in config.modalities})
         self.decoders = nnx.Dict({m.name: decoders[m.kind](m, config) for m in config.modalities})
+        if config.prior == "conditional":
+            self.prior = _Prior(config)
 
 
 @in_32_bits
@@ -241,7 +284,8 @@ def init(key: PRNGKeyArray, config: Config) -> tuple[nnx.GraphDef[MVAE], nnx.Sta
 
     Kernels are drawn from normal distributions with variance `1 / fan_in`, where `fan_in` counts only the active
     inputs. Only the first 16 components of the latent are active at the start. The weights of the others are multiplied
-    by 0.03, so that they start near the prior, and the last kernel of an image decoder by 0.1.
+    by 0.03, so that they start near the prior, and the last kernel of an image decoder by 0.1. A conditional prior
+    starts near the standard normal.
     """
     # All kernels are drawn in one call, because every shape of a draw would need a compilation of its own.
     graphdef, params, stats = nnx.split(MVAE(config), nnx.Param, nnx.BatchStat)

@@ -5,7 +5,7 @@ import functools
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -329,11 +329,18 @@ def _source(
 
 
 def paper_model(
-    modalities: tuple[str, ...], preprocessing: Preprocessing, *, measurements: Sequence[Measurement] = ()
+    modalities: tuple[str, ...],
+    preprocessing: Preprocessing,
+    *,
+    measurements: Sequence[Measurement] = (),
+    encode_condition: bool = False,
+    prior: Literal["standard", "conditional"] = "standard",
 ) -> mvae.Config:
     """Make the configuration of the networks in the See-Through-your-Skin paper. Arguments as for `frame_arrays`.
 
-    The weight of the reconstruction error is 1 for images, 1000 for the pose, and `Measurement.weight` otherwise.
+    The weight of the reconstruction error is 1 for images, 1000 for the pose, and `Measurement.weight` otherwise. The
+    fields `encode_condition` and `prior` of `mvae.Config` have no effect without a condition. The paper's equation (10)
+    is `encode_condition=True, prior="conditional"`.
     """
     shape = (*preprocessing.resolution, 3)
     standard = {name: mvae.Modality(name, "image", shape, start=0.7) for name in ("visual", "tactile")}
@@ -345,7 +352,10 @@ def paper_model(
     if unknown := set(modalities) - set(standard):
         raise ValueError(f"modalities must be some of {', '.join(standard)}, got {unknown.pop()!r}")
     chosen = [standard[name] for name in modalities]
-    return mvae.Config((*chosen, *further), condition=len(preprocessing.condition_scale))
+    width = len(preprocessing.condition_scale)
+    if not width:
+        encode_condition, prior = False, "standard"
+    return mvae.Config((*chosen, *further), condition=width, encode_condition=encode_condition, prior=prior)
 
 
 @in_32_bits

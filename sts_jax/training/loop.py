@@ -60,9 +60,9 @@ class TrainConfig:
     b1: float = field(default=0.9, metadata=_DECAY)  # Adam's decay of the mean gradient
     b2: float = field(default=0.999, metadata=_DECAY)  # Adam's decay of the mean squared gradient
     epsilon: float = field(default=1e-8, metadata=NOT_NEGATIVE)  # Adam's epsilon
-    # Adam's epsilon for the encoders of an `mvae` model (nats). Adam takes steps of full length even where a small beta
-    # makes the gradient of the divergence small, and the encoders then collapse during the warm-up of beta. With a
-    # large epsilon, gradients far below it change the encoders little.
+    # Adam's epsilon for the encoders and the prior of an `mvae` model (nats). Adam takes steps of full length even
+    # where a small beta makes the gradient of the divergence small, and the encoders then collapse during the warm-up
+    # of beta. With a large epsilon, gradients far below it change the encoders little.
     encoder_epsilon: float = field(default=1.0, metadata=NOT_NEGATIVE)
     # longer gradients are scaled down to this global norm (None: not clipped)
     clip: float | None = field(default=None, metadata=POSITIVE)
@@ -107,7 +107,7 @@ def optimiser(config: TrainConfig, total: int) -> optax.GradientTransformation:
 def _labels(params: Any) -> Any:
     paper = "decoders" in params
     return jax.tree_util.tree_map_with_path(
-        lambda path, _: "encoders" if paper and path[0].key == "encoders" else "others", params
+        lambda path, _: "encoders" if paper and path[0].key in ("encoders", "prior") else "others", params
     )
 
 
