@@ -206,10 +206,6 @@ GIVEN = {"a": NUMBERS[1]["a"]}
         (lambda *model: mvae.log_evidence(*model, jax.random.key(0), GIVEN, GIVEN, num=0), "num=0"),
         (lambda *model: mvae.log_evidence(*model, jax.random.key(0), GIVEN, GIVEN), "condition has width 0"),
         (lambda *model: mvae.Config((mvae.Modality("a", "vector", (2,)),), prior="conditional"), "condition=0"),
-        (
-            lambda *model: mvae.Config((mvae.Modality("a", "vector", (2,)),), prior="flat"),
-            "'standard' or 'conditional'",
-        ),
         (lambda *model: mvae.Modality("label", "category", (2, 2)), "'category' of shape"),
     ],
 )

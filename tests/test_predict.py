@@ -193,6 +193,16 @@ def test_a_condition_is_given_in_si_units(options):
     assert np.isnan(traced(CONDITION * np.array([[1], [1e3]])).pose).all(-1).tolist() == [False, True]
 
 
+def test_a_category_is_predicted_as_probabilities():
+    label = mvae.Modality("label", "category", (4,))
+    predictor = untrained(dataclasses.replace(SMALL, modalities=(MODALITIES[0], label)))
+    known = np.eye(4, dtype=np.float32)
+    predicted = predictor(measurements={"label": known}).measurements["label"]
+    logits, _ = mvae.predict(predictor.model.graphdef, predictor.model.state, {"label": jnp.asarray(known)})
+    np.testing.assert_allclose(predicted, jax.nn.softmax(logits["label"]), atol=1e-6)
+    np.testing.assert_allclose(predicted.sum(-1), 1, rtol=1e-5)
+
+
 def test_only_state_space_models_are_calibrated(predictor):
     with pytest.raises(ValueError, match="mvae model"):
         training.calibrate(predictor.name, training.Arrays({}, {}))
