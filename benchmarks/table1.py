@@ -3,7 +3,7 @@
     python -m benchmarks.table1 runs/table1     # about five minutes on two CPU cores
 
 The command predicts the last frames of the held-out trajectories with the stored models, computes the cross-entropies
-in float64, and compares them with `metrics.json`. Without --cells it takes a final-step and a multi-step model of the
+in float64, and compares them with `metrics.json`. Without --cells it takes a final-step and a one-step model of the
 paper, and a state-space model.
 """
 
@@ -79,7 +79,7 @@ def recomputed(folder: Path, test: dataset.Pairs) -> dict[str, float]:
 
 
 def _one_of_each_kind(metrics: dict[str, Any]) -> list[str]:
-    """A final-step and a multi-step cell of the paper's models and a state-space cell, as far as they exist."""
+    """A final-step and a one-step cell of the paper's models and a state-space cell, as far as they exist."""
     names = [
         f"{one['scenario']}/{row['side']['model']}-{row['side']['scale']}-seed{one['seeds'][0]}"
         for one in metrics["scenarios"]

@@ -193,7 +193,7 @@ def draw_scene(
     final: Mapping[str, sts.Predictor],
     step: Mapping[str, sts.Predictor],
 ) -> list[Path]:
-    """Draw held-out trajectories of a scenario with its final-step and multi-step models. Returns the files."""
+    """Draw held-out trajectories of a scenario with its final-step and one-step models. Returns the files."""
     scenario, names, drawn = scene.collection.scenario, dataset.class_names(scene.collection), []
     test = scene.test.take(figures.one_of_each(scene.test, names, SHOWN))
     every = np.arange(len(test.object))

@@ -1,6 +1,6 @@
 """The cells of Table 1: one model of a scenario, a time scale and a seed, its training, and its scores.
 
-A final-step model predicts the last frame from the first one. A multi-step model predicts the next frame, and is rolled
+A final-step model predicts the last frame from the first one. A one-step model predicts the next frame, and is rolled
 out to the last one on its own predictions.
 """
 

@@ -371,7 +371,7 @@ def _details(one: Summary) -> list[str]:
         "and 1 for the true image. Slashes separate the weights of the last step from those of the least validation "
         "loss. The one-step excess is that of the next frame, predicted from a true frame, as a mean over several "
         "moments, and for the state-space model from frame 0 only. It stands beside the excess of the last frame, "
-        "which a multi-step model predicts from its own predictions.",
+        "which a one-step model predicts from its own predictions.",
         "",
         *lines,
         "",
