@@ -51,6 +51,7 @@ NAMES: dict[str, str] = {
 }
 TOUCHLESS = ("freefall",)  # scenarios in whose first frames nothing touches the pad
 ALL, ONE_STEP = "all inputs", "one step"  # of the inputs, all. Instead of them: the errors of one step, of all moments
+SUBSETS = (("visual",), ("tactile",), ("visual", "tactile"), ("visual", "pose"))
 WEIGHTS = ("last", "best")  # weights of the last step, and those with the least validation loss
 REFERENCES = dict(zip(("constant", "copy", "ceiling"), (*evaluation.BASELINES[:2], evaluation.CEILING), strict=True))
 SCORED = tuple(m for m in evaluation.METRICS if m.name in ("visual_bce", "tactile_bce", "position_on_pad"))
@@ -359,13 +360,10 @@ def _summed(moments: Sequence[Scores]) -> Scores:
 
 
 def asked(cell: Cell, modalities: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
-    """The subsets of its inputs for which a model is scored: one-step models get all, because a roll-out is slow."""
-    if cell.scale == "step" or not modalities:
-        return {ALL: modalities}
-    every = evaluation.subsets(modalities).values()
-    if cell.model in STATE:
-        every = [s for s in every if s in (("visual",), ("tactile",), ("visual", "tactile"), ("visual", "pose"))]
-    return {**{" and ".join(subset): subset for subset in every if subset != modalities}, ALL: modalities}
+    """The inputs from which a model is scored: all, and for a final-step model also some of them."""
+    some = SUBSETS if cell.scale == "final" else ()
+    chosen = {" and ".join(s): s for s in some if set(s) < set(modalities)}
+    return {**chosen, ALL: modalities}
 
 
 def references(config: Config, sensor: sts.Sensor, workdir: Path, scene: Scene) -> Scores:
