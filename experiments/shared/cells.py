@@ -292,7 +292,7 @@ def _paper(config: Config, sensor: sts.Sensor, scene: Scene, cell: Cell) -> tupl
             in_memory=config.in_memory,
         )
         held, _ = training.step_arrays(scene.data, few, modalities, plain, blank, stride=config.stride)
-    model = training.paper_model(modalities, view)
+    model = training.paper_model(modalities, view, encode_condition=config.encode_condition, prior=config.prior)
     schedule = dataclasses.replace(config.training, seed=cell.seed)
     return Job(cell.name, schedule, model, arrays, view, scene.empty), held
 
