@@ -243,7 +243,7 @@ def _compared(
     latent: np.ndarray, given: np.ndarray, objects: np.ndarray, num: int, seed: int
 ) -> dict[str, dict | None]:
     def statistic(weight: np.ndarray) -> np.ndarray:
-        one, two = (metrics.skill(*values.T, weight) for values in (latent, given))
+        one, two = (metrics.skill(values[:, 0], values[:, 1], weight) for values in (latent, given))
         return np.array([one, two, one - two])
 
     value, draws = statistic(np.ones(len(objects))), metrics.bootstrap(objects, statistic, num=num, seed=seed)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
@@ -291,7 +292,7 @@ def _draw_pose(axis: Axes, size: np.ndarray, true: np.ndarray, predicted: np.nda
 
 
 def _legend(figure: plt.Figure, outlines: bool, fontsize: float) -> None:
-    handles = [
+    handles: list[Artist] = [
         Line2D([], [], color="0.3", linewidth=3.2, alpha=0.55, label="predicted frame"),
         Line2D([], [], color="0.3", linewidth=1.3, linestyle=(0, (2.2, 1.1)), label="true frame"),
         *(Line2D([], [], color=colour, linewidth=2, label=name) for name, colour in zip("xyz", _AXES, strict=True)),
