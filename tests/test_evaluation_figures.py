@@ -266,3 +266,16 @@ def test_curves_are_means_over_the_objects_that_stay(tmp_path, drawn):
     assert visual.lines[-1].get_linestyle() == "--"
     band = visual.collections[0].get_paths()[0].vertices[:, 1]
     assert band.min() < 1e4 * curve.errors["visual"][1].mean() < band.max()
+
+
+def test_predictions_that_do_not_fit_a_figure_are_named(tmp_path):
+    test, both = judged()
+    path, steps = tmp_path / "a.png", [both] * 3
+    images = dataset.Images(test.visual[:, 0], test.tactile[:, 0], test.segmentation[:, 0])
+    with pytest.raises(ValueError, match="3 steps of 2 frames, but the trajectory has 6 frames: give at most 2 steps"):
+        figures.rollout_strip(path, np.arange(6), images, steps, 0, stride=2)
+    with pytest.raises(ValueError, match=r"from_touch\.visual or from_vision\.tactile is None"):
+        figures.crossed_sheet(path, test, Predicted(tactile=both.tactile), both, np.array([0]), **SCENE)
+    with pytest.raises(ValueError, match=r"`time` has 1 times, but the numbers of predictions are .*'visual': 2"):
+        evaluation.error_curve([0.1], [(both, test), (both, test)])
+    assert not path.exists()

@@ -165,6 +165,11 @@ def error_curve(time: Sequence[float] | np.ndarray, steps: Iterable[tuple[Predic
             if images is not None:
                 error = metrics.image_error(in_unit(images), in_unit(getattr(pairs, stream)[:, 1]))
                 errors.setdefault(stream, []).append(error.excess / error.pixels)
+    if any(len(values) != len(time) for values in errors.values()):
+        counts = {name: len(values) for name, values in errors.items()}
+        raise ValueError(
+            f"`time` has {len(time)} times, but the numbers of predictions are {counts}: give one per time"
+        )
     return Curve(np.asarray(time), {name: np.stack(values) for name, values in errors.items()})
 
 

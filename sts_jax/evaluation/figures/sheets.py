@@ -134,8 +134,10 @@ def crossed_sheet(
 ) -> None:
     """Draw vision predicted from touch alone, and touch from vision alone. Arguments as for `pose_sheet`."""
     vision, touch = _inputs(test, items)
-    assert from_touch.visual is not None
-    assert from_vision.tactile is not None
+    if from_touch.visual is None or from_vision.tactile is None:
+        raise ValueError(
+            "from_touch.visual or from_vision.tactile is None: give predictions of a model of both streams"
+        )
     groups = [
         [touch, _Row("visual\nfrom touch alone", from_touch.visual[items], True), _true(test, "visual", items)],
         [vision, _Row("tactile\nfrom vision alone", from_vision.tactile[items], True), _true(test, "tactile", items)],
@@ -166,6 +168,11 @@ def rollout_strip(
         direct: Predictions of the last frame from the first one, by another model. They have their own column.
         num: Largest number of frames of the roll-out.
     """
+    if stride * len(rolled) >= len(time):
+        raise ValueError(
+            f"the roll-out has {len(rolled)} steps of {stride} frames, but the trajectory has {len(time)} frames: give "
+            f"at most {(len(time) - 1) // stride} steps"
+        )
     chosen = np.unique(np.round(1 + (len(rolled) - 1) * np.linspace(0, 1, num) ** 1.8).astype(int))
     frames = [0, *(stride * chosen).tolist()]
     heads = [f"{time[t]:.2f} s" for t in frames]
