@@ -230,6 +230,16 @@ def test_every_reroll_begins_at_the_start_of_its_item_and_its_end_is_a_sample(en
     assert found.outcome.tolist() == [physics.Outcome.RESTS] * 3
 
 
+def test_rerolls_give_the_frames_that_the_pairs_have(engine):
+    test = starts()
+    for number, off in ((0, np.zeros(3)), (1, OFF_FIRST)):
+        at = test._replace(frame=np.broadcast_to([0, number], (3, 2)))
+        found = evaluation.ceiling(COLLECTION, sts.Sensor(), at, TIMES, jax.random.key(0))
+        np.testing.assert_allclose(found.samples.pose[:, :, 2], test.pose[:, 0, 2] + off[:, None], atol=1e-6)
+    with pytest.raises(ValueError, match="begin at frame 1, but a re-roll begins at rest in frame 0"):
+        evaluation.ceiling(COLLECTION, sts.Sensor(), at._replace(frame=at.frame + 1), TIMES, jax.random.key(0))
+
+
 def test_bad_calls_are_refused():
     with pytest.raises(ValueError, match="times must be >= 1"):
         evaluation.ceiling(COLLECTION, sts.Sensor(), starts(), 0, jax.random.key(0))

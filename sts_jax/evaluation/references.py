@@ -151,6 +151,8 @@ def ceiling(
 ) -> Predicted:
     """Compute the best possible prediction from the first pose and the condition, by re-rolls of each item.
 
+    It is that of the second frames of `test`. The outcomes are those of whole trajectories.
+
     The re-rolls and the true trajectory are draws from the same distribution, so the prediction is calibrated. With
     infinitely many re-rolls, it has the best expected log loss of the outcome and the best expected cross-entropy of
     the images among all predictions from the shape, the pose and the condition. A model that uses the first tactile
@@ -167,6 +169,11 @@ def ceiling(
     """
     if times < 1:
         raise ValueError(f"times must be >= 1, got {times}")
+    if test.frame is not None and test.frame[:, 0].any():
+        raise ValueError(
+            f"`test` has pairs that begin at frame {test.frame[:, 0].max()}, but a re-roll begins at rest in frame 0: "
+            "make it with Dataset.pairs(..., frames=(0, t))"
+        )
     scenario = collection.scenario
     owners, place = np.unique(test.object, return_inverse=True)
     bodies = dataset.make_bodies(collection, owners)
@@ -185,7 +192,9 @@ def ceiling(
         engine=collection.engine,
         progress=progress or False,
     )
-    pose, wrench = (np.asarray(leaf[:, -1]) for leaf in (traj.pose, traj.wrench))
+    frame = np.full(len(place), -1) if test.frame is None else test.frame[:, 1]
+    rows = np.arange(len(place) * times), np.repeat(frame, times)
+    pose, wrench = (np.asarray(leaf)[rows] for leaf in (traj.pose, traj.wrench))
     images = _render(collection, sensor, bodies, np.repeat(place, times), pose, wrench, test.visual.shape[2])
 
     def samples(leaf: np.ndarray) -> np.ndarray:
