@@ -24,13 +24,15 @@ def test_frames_and_the_views_after_them_are_read_in_the_given_order(tmp_path):
     views = np.random.default_rng(1).integers(0, 256, (3, 9, 7, 3), dtype=np.uint8)
     halves = [records.Images(*(leaf[part] for leaf in images)) for part in (slice(3), slice(3, 5))]
     records.write_images(path, [*halves, (views,)])
-    back = records.read_images(path, np.array([4, 0, 2]), resolution=(9, 7), total=8)
+    shard = records.Shard(path, resolution=(9, 7), total=8)
+    back = shard.images(np.array([4, 0, 2]))
     for written, read in zip(images, back, strict=True):
         np.testing.assert_array_equal(written[[4, 0, 2]], read)
-    read = records.read_views(path, np.array([7, 5]), resolution=(9, 7), total=8)
-    np.testing.assert_array_equal(read, views[[2, 0]])
+    np.testing.assert_array_equal(shard.views(np.array([7, 5])), views[[2, 0]])
     with pytest.raises(storage.DamagedFileError, match=r"it has 8 records, but should have 5"):
-        records.read_images(path, np.arange(5), resolution=(9, 7), total=5)
+        records.Shard(path, resolution=(9, 7), total=5)
+    with pytest.raises(storage.DamagedFileError, match=r"a record does not have 386 bytes"):
+        shard.images(np.array([5]))
 
 
 @pytest.mark.parametrize("keep", [0.0, 0.5, 0.9])
@@ -39,7 +41,7 @@ def test_a_truncated_file_is_named(tmp_path, keep):
     records.write_images(path, [some_images(50)])
     path.write_bytes(path.read_bytes()[: int(keep * path.stat().st_size)])
     with pytest.raises(storage.DamagedFileError, match=r"a\.array_record"):
-        records.read_images(path, np.arange(50), resolution=(9, 7), total=50)
+        records.Shard(path, resolution=(9, 7), total=50).images(np.arange(50))
     arrays = tmp_path / "a.npz"
     storage.write_arrays(arrays, {"x": np.arange(3000)})
     arrays.write_bytes(arrays.read_bytes()[: int(keep * arrays.stat().st_size)])

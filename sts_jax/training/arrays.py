@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 from sts_jax import mvae, optics, physics, statespace
 from sts_jax._checked import checked, in_32_bits
 from sts_jax.dataset import Dataset, Ends, Measurement, Pairs, Views, reduced_images
+from sts_jax.dataset.records import Shard
 from sts_jax.sensor import Sensor
 from sts_jax.training.preprocess import Preprocessing
 
@@ -309,9 +310,10 @@ def _source(
 ) -> Source:
     """The images of the stored frames `rows`, of the given height and width."""
     names = [name for name in modalities if name != "pose"]
+    opened: dict[int, Shard] = {}
 
     def read(rows: np.ndarray) -> dict[str, np.ndarray]:
-        images = data.images(rows)
+        images = data.images(rows, opened=opened)
         found = {name: getattr(images, name) for name in names}
         return found if size == images.visual.shape[1:3] else reduced_images(found, size[0])
 
