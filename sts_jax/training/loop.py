@@ -259,7 +259,7 @@ def train(
     task.check(arrays)
     if loss is not None:
         task = task._replace(loss=loss, score=loss)
-    settings = {
+    settings: dict[str, Any] = {
         "kind": next(name for name, kind in KINDS.items() if isinstance(model, kind.Config)),
         "model": asdict(model),
         "training": asdict(config),

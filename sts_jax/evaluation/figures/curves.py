@@ -32,7 +32,7 @@ def training_curves(path: Path, logs: Mapping[str, Sequence[Mapping[str, float]]
     """
     keys = [
         key
-        for key in ("loss", "kl", "look", "visual", "tactile", "state", "outcome", "pose")
+        for key in ("loss", "validation", "kl", "look", "visual", "tactile", "state", "outcome", "pose")
         if any(key in e for log in logs.values() for e in log)
     ]
     # For a state-space model, `pose` is the nats of a density, and `state` is the squared error of the first pose.
