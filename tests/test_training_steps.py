@@ -9,6 +9,7 @@ from extending_page import blocks
 from statespace_config import Killed, kill_at, same
 from stored_frames import BLANK, FRAMES, RATE, SIZE, preprocessing, stored
 
+import sts_jax as sts
 from sts_jax import dataset, evaluation, geometry, mvae, physics, training
 
 NAMES = ("visual", "tactile", "pose")
