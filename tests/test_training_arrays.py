@@ -1,13 +1,16 @@
 """Arrays in memory: batches, their order, and the checksum."""
 
 import dataclasses
+import functools
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
 from recorded_session import SQUARE, drawn
 
-from sts_jax import training
+import sts_jax as sts
+from sts_jax import dataset, physics, training
 
 
 def arrays(*, further=True):
@@ -100,3 +103,67 @@ def test_invalid_shapes_and_shifts_are_refused():
         training.shifted(images, EMPTY, np.array([[1, 0], [2, 0]]))
     with pytest.raises(ValueError, match=r"resize them to \(32, 32\)"):
         training.image_arrays(images, images, ("visual",), training.Preprocessing((32, 32)), EMPTY)
+
+
+COUNT, TIMES, SIDE = 4, 9, 32  # trajectories, frames of each, pixels
+
+
+def trajectories(condition):
+    """Pairs, further falls and the dataset of random trajectories, with images that all show a contact."""
+    rng = np.random.default_rng(0)
+    quat = rng.normal(size=(COUNT, TIMES, 4))
+    pose = np.concatenate(
+        [0.02 * rng.normal(size=(COUNT, TIMES, 3)), quat / np.linalg.norm(quat, axis=2, keepdims=True)], axis=2
+    ).astype(np.float32)
+    solid = {
+        "support": rng.uniform(0.01, 0.03, (COUNT, 128)).astype(np.float32),
+        "mass": rng.uniform(0.02, 0.2, COUNT).astype(np.float32),
+        "com": np.zeros((COUNT, 3), np.float32),
+    }
+    given = {"condition": condition, "outcome": np.array([0, 1, 1, 0], np.int32)}
+    time = np.broadcast_to(0.032 * np.arange(TIMES, dtype=np.float32), (COUNT, TIMES))
+    nothing = dict.fromkeys(("frames", "shard_of", "record_of", "view_shard_of", "view_record_of"), np.zeros(0, int))
+    data = dataset.Dataset(
+        {}, "", {}, {"pose": pose, "time": time, **given}, {}, solid, {}, shards=(), **nothing
+    )
+    images = rng.integers(0, 256, (2, COUNT, 2, SIDE, SIDE, 3)).astype(np.uint8)
+    ends = {"pose": pose[:, [0, -1]], **given, **solid, "object": np.arange(COUNT), "trajectory": np.arange(COUNT)}
+    shows = np.ones((COUNT, 2), bool)
+    pairs = dataset.Pairs(*images, segmentation=np.broadcast_to(shows[..., None, None], images.shape[1:5]), contact=shows, **ends)
+    return pairs, dataset.Ends(**ends), data
+
+
+def test_a_one_step_model_gets_the_poses_and_conditions_of_all_frames():
+    condition = np.random.default_rng(1).normal(size=(COUNT, 3)).astype(np.float32)
+    scenario = dataclasses.replace(physics.Perturbed(), rate=31.25)
+    pairs, falls, data = trajectories(condition)
+    empty = dict.fromkeys(("visual", "tactile"), np.full((SIDE, SIDE, 3), 128, np.uint8))
+    view = training.Preprocessing((SIDE, SIDE), condition_scale=scenario.condition_scale)
+    made = functools.partial(training.state_model, pairs, sts.Sensor(), scenario, view, empty, image_size=16)
+    model, own = made(stride=2, inputs=("visual", "pose"))
+    assert (own.stride, own.period, own.condition_scale) == (2, 0.064, (*scenario.condition_scale, 1.0))
+    assert (model.stride, model.condition, model.inputs, model.outcomes) == (2, 4, ("visual", "pose"), 1)
+    pairs = pairs._replace(outcome=np.full(COUNT, 1, np.int32))
+    falls = falls._replace(outcome=pairs.outcome)
+    arrays = training.state_arrays(pairs, model, scenario, own, empty, falls=falls, data=data)
+    training.arrays.check(model, arrays)
+    course = np.asarray(own.encode_pose(jnp.asarray(data.trajectory["pose"])))
+    for part in (arrays.targets, arrays.falls):
+        np.testing.assert_allclose(part["course"], course, atol=1e-6)
+        np.testing.assert_array_equal(part["outcome"], 0)
+    assert "pose" not in arrays.falls
+    np.testing.assert_allclose(arrays.targets["pose"], course[:, -1], atol=1e-6)
+    expected = np.concatenate([np.repeat(condition[:, None], TIMES, 1), data.trajectory["time"][..., None]], axis=2)
+    for found in (arrays.condition, arrays.falls["condition"]):
+        np.testing.assert_allclose(found * [*scenario.condition_scale, 1.0], expected, rtol=1e-5)
+    for change, message in (
+        ({"data": None}, "a one-step model needs the poses in all frames: give data="),
+        ({"model": dataclasses.replace(model, stride=TIMES)}, "stride is 9, but the trajectories have 9 frames"),
+    ):
+        given = {"pairs": pairs, "model": model, "scenario": scenario, "preprocessing": own, "empty": empty, "data": data}
+        with pytest.raises(ValueError, match=message):
+            training.state_arrays(**given | change)
+    final, same = made(inputs=("tactile",))
+    assert (final.stride, final.condition, final.inputs, same) == (0, 3, ("tactile",), view)
+    with pytest.raises(ValueError, match="needs shape|`inputs`"):
+        training.arrays.check(final, arrays)

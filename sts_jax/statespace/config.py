@@ -15,7 +15,7 @@ class LossWeights:
 
     tactile: float = 4.0  # error of the last tactile image
     state: float = 16.0  # squared error of each encoder's state code
-    pose: float = 4.0  # negative log likelihoods of the final pose and of the encoders' estimates
+    pose: float = 4.0  # negative log likelihoods of the final pose (or of a step) and of the encoders' estimates
     outcome: float = 8.0  # negative log likelihood of the outcome
     covered: float = 0.15  # cross-entropy of the object's outline
     first: float = 0.5  # errors of the images of the first frame
@@ -40,7 +40,7 @@ class Config:
     degree: int = 3  # largest degree of the spherical harmonics of these functions
     directions: int = 24  # number of directions at which the decoder sees the values of these functions
     support: int = 64  # number of directions at which transition and decoder see the support functions
-    components: int = 6  # Gaussians in the density of the final pose for each outcome
+    components: int = 6  # Gaussians in the density of the final pose for each outcome, or of one step
     window: int = 32  # pixels, side of the magnified window around the object that an encoder sees
     encoder: tuple[int, ...] = (64, 128, 128)  # channels at 1/2, 1/4 and 1/8 of the window's resolution
     decoder: tuple[int, ...] = (128, 64, 32)  # channels at 1/8, 1/4 and 1/2 of the canvas's resolution
@@ -54,6 +54,9 @@ class Config:
     vectors: int = 1  # number of vectors (x, y) in the plane of the pad with which the condition begins
     # name of each outcome in words, such as "fell off", or empty if the names are unknown
     outcome_names: tuple[str, ...] = ()
+    # number of frames by which the transition advances the state (0: to the last frame). A one-step model has one
+    # outcome, because the outcome follows from the first and the last pose. Its condition ends with the time
+    stride: int = 0
 
     def __post_init__(self) -> None:
         if [name for name in INPUTS if name in self.inputs] != list(self.inputs) or not set(self.inputs) & set(IMAGES):
@@ -70,6 +73,10 @@ class Config:
             raise ValueError(
                 f"condition must be >= 2 * vectors >= 0, got condition={self.condition} and vectors={self.vectors}: "
                 "set condition to len(scenario.condition_scale) and vectors to scenario.vectors"
+            )
+        if self.stride < 0 or (self.stride and self.outcomes != 1):
+            raise ValueError(
+                f"stride must be 0, or >= 1 with outcomes=1, got stride={self.stride} and outcomes={self.outcomes}"
             )
         if self.traits < TINT:
             raise ValueError(f"traits must be >= {TINT}, because the first {TINT} are the tint, got {self.traits}")

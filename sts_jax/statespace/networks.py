@@ -3,7 +3,8 @@
 - An encoder for each kind of image (visual and tactile) returns a Gaussian over the state code and the appearance code,
   which the program calls `look`. The belief is the product of the prior and the Gaussians of all inputs (`fuse`).
 - The transition maps the belief about the state code and the condition to a density of the final pose and of the
-  rotation from the first to the final pose.
+  rotation from the first to the final pose. In a one-step model (`Config.stride`), it also receives the velocity, and
+  returns a density of the motion over the next step.
 - The decoder renders both images of an object in a given pose, from the latent and the rotation since the first frame.
   `compose` adds the images of the empty sensor.
 
@@ -11,6 +12,7 @@ All convolutions have stride 1, for which XLA's CPU backend is fast. To reduce a
 into channels. To enlarge an image, channels are unfolded into blocks of pixels.
 """
 
+import math
 from typing import NamedTuple
 
 import jax
@@ -29,6 +31,9 @@ EXACT_LOG_VAR = -9.2  # log variance of a pose that is an input: 0.5 mm for a po
 CONTRAST = 40.0  # contrast of samples without a calibration, see `compose`
 _LOG_VAR_LIMIT = 8.0  # largest absolute value of an encoder's log variances
 _FINAL_LOG_VAR = (-3.0, 5.0)  # range of the log variances of the final pose: its centre and half of its width
+_STEP_LOG_VAR = (-8.0, 7.0)  # the same for the motion over one step: from 0.03 mm to 30 mm
+_STEP = 0.1  # unit of the correction of a constant velocity, in numbers of a motion
+_SLOW = 20.0  # factor of a velocity whose saturated value is a further input. It separates slow objects from resting ones
 _OUTSIDE = 8.0  # difference of the logit of being covered by the object, between inside and outside of the canvas
 # The tint describes the mean colour of the object in the visual image. For each colour channel, it is the mean change
 # from the empty sensor over the pixels that show the object, minus _MIDDLE, divided by _WIDTH. The tint has
@@ -43,14 +48,14 @@ class FinalPose(NamedTuple):
     """The predicted density of the final pose of n objects: for each outcome, a mixture of k Gaussians over 21 numbers.
 
     The first 12 numbers are the final pose code. The other 9 are the matrix of the rotation from the first to the final
-    pose, row by row. All refer to a frame with the origin and the z axis of the sensor frame, and an x axis along
-    `heading`.
+    pose, row by row. In a one-step model, the 6 numbers of a motion (`poses`) take the place of the 21. All refer to a
+    frame with the origin and the z axis of the sensor frame, and an x axis along `heading`.
     """
 
     outcome: Float[Array, "n outcomes"]  # log probability of each outcome
     weight: Float[Array, "n outcomes k"]  # log weight of each component of an outcome
-    mean: Float[Array, "n outcomes k 21"]  # mean of each component
-    log_var: Float[Array, "n outcomes k 21"]  # log variances of each component
+    mean: Float[Array, "n outcomes k m"]  # mean of each component
+    log_var: Float[Array, "n outcomes k m"]  # log variances of each component
     heading: Float[Array, "n 2"]  # cosine and sine of the angle from the sensor's x axis, see `state.heading`
 
 
@@ -227,28 +232,33 @@ class Encoder(nnx.Module):
 
 
 class Transition(nnx.Module):
-    """Predicts the density of the final pose from the state in the first frame.
+    """Predicts the density of the final pose from the state in the first frame, or that of a step from any state.
 
-    The appearance code is not an input. Otherwise, the transition would recognise training objects by their appearance
+    The mean of a step is the velocity plus a learnt correction, as if inertia alone moved the object. The appearance code is not an input. Otherwise, the transition would recognise training objects by their appearance
     (see docs/trials.md).
     """
 
     def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
         self.config = config
         number = 2 * poses.CODE + 7 + 5 + 2 * config.support + 4 + 2 * config.condition
+        number += 2 * poses.MOTION + 1 if config.stride else 0
+        self.size = poses.MOTION if config.stride else poses.MOVE
         self.first = nnx.Linear(number, config.transition, rngs=rngs)
         self.layers = nnx.List([_ResidualDense(config.transition, rngs) for _ in range(3)])
         self.norm = nnx.LayerNorm(config.transition, rngs=rngs)
         self.outcome = nnx.Linear(config.transition, config.outcomes, kernel_init=_SMALL, rngs=rngs)
-        components = config.outcomes * config.components * (1 + 2 * poses.MOVE)
+        components = config.outcomes * config.components * (1 + 2 * self.size)
         self.mixture = nnx.Linear(config.transition, components, kernel_init=_SMALL, rngs=rngs)
 
-    def __call__(self, belief: Gaussian, condition: Float[Array, "n c"] | None) -> FinalPose:
-        """Predict the density of the final pose, in a frame whose x axis is the heading of the mean state.
+    def __call__(
+        self, belief: Gaussian, condition: Float[Array, "n c"] | None, velocity: Float[Array, "n 6"] | None = None
+    ) -> FinalPose:
+        """Predict the density of the final pose or of a step, in a frame whose x axis is the heading of the mean state.
 
         Args:
             belief: Belief about the state code, `(n, code)`.
             condition: From `training.Preprocessing.encode_condition`, or None.
+            velocity: The motion over the last step, for a one-step model.
         """
         config = self.config
         known = state.split(belief.mean)
@@ -270,18 +280,22 @@ class Transition(nnx.Module):
         if condition is not None:
             pairs = [condition[:, 2 * k : 2 * k + 2] for k in range(config.vectors)]
             features += [condition, *(poses.turn_back(heading, pair) for pair in pairs), condition[:, 2 * len(pairs) :]]
+        still = jnp.broadcast_to(jnp.eye(3), (len(here), 3, 3))
+        likely, unit, (middle, reach) = _joined(here, still), 1.0, _FINAL_LOG_VAR
+        if velocity is not None:
+            likely, unit, (middle, reach) = poses.turn_motion_back(heading, velocity), _STEP, _STEP_LOG_VAR
+            gap = config.position_scale * known.pose[:, 2] - state.reach(known, still)
+            features += [likely, jnp.tanh(_SLOW * likely), gap[:, None] / state.LENGTH]
         x = self.first(_joined(*features))
         for layer in self.layers:
             x = layer(x)
         x = jax.nn.swish(self.norm(x))
         mixture = self.mixture(x).reshape(len(x), config.outcomes, config.components, -1)
-        middle, reach = _FINAL_LOG_VAR
-        stays = jnp.broadcast_to(jnp.eye(3).reshape(9), (len(x), 9))
         return FinalPose(
             outcome=jax.nn.log_softmax(self.outcome(x)),
             weight=jax.nn.log_softmax(mixture[..., 0]),
-            mean=_joined(here, stays)[:, None, None] + mixture[..., 1 : 1 + poses.MOVE],
-            log_var=middle + reach * jnp.tanh(mixture[..., 1 + poses.MOVE :] / reach),
+            mean=likely[:, None, None] + unit * mixture[..., 1 : 1 + self.size],
+            log_var=middle + reach * jnp.tanh(mixture[..., 1 + self.size :] / reach),
             heading=heading,
         )
 
@@ -415,6 +429,13 @@ def fuse(estimates: dict[str, Gaussian], counts: dict[str, Bool[Array, "n"]]) ->
 def of_state(belief: Gaussian) -> Gaussian:
     """Marginal of the belief over the state code."""
     return Gaussian(belief.mean[:, : state.CODE], belief.log_var[:, : state.CODE])
+
+
+def moved(belief: Gaussian, position: Float[Array, "n 3"], rotation: Float[Array, "n 3 3"]) -> Gaussian:
+    """Belief about the state code after a known rotation in the sensor frame, with a known new position code."""
+    mean = state.moved(state.split(belief.mean), position, rotation)
+    variance = state.moved_variance(state.split(jnp.exp(belief.log_var)), math.exp(EXACT_LOG_VAR), rotation)
+    return Gaussian(state.join(mean), jnp.log(state.join(variance)))
 
 
 def counted(counts: Bool[Array, "n"], values: Float[Array, "n ..."]) -> Float[Array, "n ..."]:

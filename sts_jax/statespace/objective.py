@@ -17,6 +17,10 @@ least one image.
 Views contribute to `state` and `doubt`. In `first` and `covered`, they replace the first frames of the trajectories.
 Falls contribute to `outcome` and `pose`. The belief of a fall is made from the true state. In every second fall, noise
 is added to the shape and the mass.
+
+In a one-step model, `pose` is the NLL of the motion over one step from a random frame of each trajectory or fall. The
+belief about the first frame is moved along the true course to this frame, as a roll-out moves it along a predicted
+course. `outcome` is 0.
 """
 
 import itertools
@@ -26,13 +30,14 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from sts_jax._checked import in_32_bits
 from sts_jax.mvae import Gaussian, kl_standard_normal
 from sts_jax.statespace import poses, state, window
-from sts_jax.statespace.config import IMAGES, TINT
+from sts_jax.statespace.config import IMAGES, TINT, Config
 from sts_jax.statespace.networks import (
     EXACT_LOG_VAR,
     FinalPose,
@@ -41,11 +46,15 @@ from sts_jax.statespace.networks import (
     counted,
     experts,
     fuse,
+    moved,
     of_state,
     reduced,
 )
 
 _LEAST = 1 / 1020  # rendered images are clipped to this distance from 0 and 1
+# Standard deviation of the noise in the poses and velocities from which a one-step model learns, as motions: 0.2 mm for
+# a position scale of 50 mm, and 0.3 degrees
+_JITTER = np.repeat(np.float32([0.004, 0.005]), 3)
 
 
 def log_density(
@@ -62,15 +71,22 @@ def log_density(
     Returns:
         The log probability of `outcome`, and the log density of `code` and `turn` for this outcome.
     """
+    heading = poses.about_vertical(final.heading)
+    level = (jnp.swapaxes(heading, -1, -2) @ turn @ heading).reshape(-1, 9)
+    move = jnp.concatenate([poses.turn_code_back(final.heading, code), level], axis=-1)
+    return _log_mixture(final, move, outcome)
+
+
+def _log_mixture(
+    final: FinalPose, numbers: Float[Array, "n m"], outcome: Int[Array, "n"]
+) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
+    """Log probability of the outcomes, and log density of the numbers in the frame of the heading for this outcome."""
 
     def of_outcome(x: Array) -> Array:
         return jnp.take_along_axis(x, outcome.reshape(-1, *(1,) * (x.ndim - 1)), axis=1)[:, 0]
 
     weight, mean, log_var = (of_outcome(x) for x in (final.weight, final.mean, final.log_var))
-    heading = poses.about_vertical(final.heading)
-    level = (jnp.swapaxes(heading, -1, -2) @ turn @ heading).reshape(-1, 9)
-    move = jnp.concatenate([poses.turn_code_back(final.heading, code), level], axis=-1)
-    error = move[:, None] - mean
+    error = numbers[:, None] - mean
     each = -0.5 * jnp.sum(error**2 * jnp.exp(-log_var) + log_var + math.log(2 * math.pi), axis=-1)
     return of_outcome(final.outcome), jax.nn.logsumexp(weight + each, axis=-1)
 
@@ -94,14 +110,27 @@ def excess(
 
 
 class _Ends(NamedTuple):
-    """Beliefs about the first frames of trajectories, with the true first states and final poses."""
+    """Beliefs about the first frames of trajectories, with the true first states and final poses.
+
+    In a one-step model, `pose` and `condition` have an axis of frames in front of the last axis.
+    """
 
     belief: Gaussian  # of the state code
     state: Float[Array, "n code"]  # true state codes of the first frame
-    pose: Float[Array, "n 12"]  # pose codes of the last frame
+    pose: Float[Array, "n *f 12"]  # pose codes of the last frame
     outcome: Int[Array, "n"]  # index of the outcome
-    condition: Float[Array, "n c"] | None
+    condition: Float[Array, "n *f c"] | None
     counts: Bool[Array, "n"]  # False for items without an input
+
+
+class _Steps(NamedTuple):
+    """Steps of one-step models, each from one frame of a trajectory."""
+
+    belief: Gaussian  # of the state code in this frame
+    velocity: Float[Array, "n 6"]  # motion over the step before
+    motion: Float[Array, "n 6"]  # motion over the step
+    condition: Float[Array, "n c"] | None
+    gone: Bool[Array, "n"]  # True for objects that have left the pad and no longer move
 
 
 class _Pictures(NamedTuple):
@@ -124,7 +153,7 @@ def loss(
     empty: dict[str, Float[Array, "size size 3"]],
     *,
     present: dict[str, Bool[Array, "n"]] | None = None,
-    condition: Float[Array, "n c"] | None = None,
+    condition: Float[Array, "n *f c"] | None = None,
     views: dict[str, Array] | None = None,
     falls: dict[str, Array] | None = None,
     beta: float | Float[Array, ""] = 1.0,
@@ -137,14 +166,16 @@ def loss(
             side `input_size`, and pose codes `pose` `(n, 12)`.
         targets: Images `visual` and `tactile` of the last frame in [0, 1] with the side `image_size`, state codes
             `state` of the first frames, pose codes `pose` of the last frames, and `outcome`, `(n,)`, indices into the
-            outcomes of the scenario.
+            outcomes of the scenario. A one-step model also needs the pose codes `course` of all f frames, `(n, f, 12)`.
+            Its images may then be those of any frame, of which `pose` is the pose.
         empty: `visual` and `tactile` image of the empty sensor in [0, 1], with the side `input_size`.
         present: Masks `(n,)` of the inputs. An input without a mask is present in all items. Each item must have at
             least one input. Values of items whose mask is False have no influence and may be NaN.
-        condition: From `training.Preprocessing.encode_condition`, or None.
+        condition: From `training.Preprocessing.encode_condition`, or None. For a one-step model, in all f frames.
         views: Images `visual` `(m, size, size, 3)` in [0, 1] with the side `input_size`, and state codes `state`. The
             model must have the input `visual`.
-        falls: `state`, `pose` and `outcome` as in `targets` and, if the model has a condition, `condition`.
+        falls: `state`, `pose` (for a one-step model `course`) and `outcome` as in `targets` and, if the model has a
+            condition, `condition`.
         beta: Weight of the divergence of the appearance code from its prior.
 
     Returns:
@@ -158,6 +189,7 @@ def loss(
     number = len(targets["pose"])
     counts = {name: jnp.ones(number, bool) for name in config.inputs} | (present or {})
     choice, noise, blur, other = jax.random.split(key, 4)
+    end = "course" if config.stride else "pose"
     estimates = experts(model, inputs, counts, empty)
     images = [name for name in IMAGES if name in estimates]
     seen = {} if views is None else {"visual": model.encoders["visual"](views["visual"] - empty["visual"])}
@@ -166,12 +198,13 @@ def loss(
     subsets = [s for size in range(1, len(config.inputs) + 1) for s in itertools.combinations(config.inputs, size)]
     members = [{name: counts[name] & (name in subset) for name in config.inputs} for subset in subsets]
     beliefs = [fuse(estimates, masks) for masks in members]
-    truth = targets["state"], targets["pose"], targets["outcome"], condition
+    truth = targets["state"], targets[end], targets["outcome"], condition
     usable = [jnp.any(jnp.stack(list(masks.values())), axis=0) for masks in members]
     ends = [_Ends(of_state(belief), *truth, masks) for belief, masks in zip(beliefs, usable, strict=True)]
     if falls is not None:
-        ends.append(_known_ends(blur, falls))
-    terms |= _end_terms(model, jax.tree.map(lambda *x: jnp.concatenate(x), *ends))
+        ends.append(_known_ends(blur, falls, end))
+    every = jax.tree.map(lambda *x: jnp.concatenate(x), *ends)
+    terms |= _step_terms(model, jax.random.fold_in(key, 0), every) if config.stride else _end_terms(model, every)
 
     belief = _drawn_belief(choice, images, members, beliefs)
     # The divergence excludes the tint, because the encoder measures it and does not learn it.
@@ -266,8 +299,8 @@ def _drawn_belief(
     return jax.tree.map(lambda x: jnp.take_along_axis(x, chosen[:, None, None], axis=1)[:, 0], stacked)
 
 
-def _known_ends(key: PRNGKeyArray, falls: dict[str, Array]) -> _Ends:
-    """Trajectories without images, with a belief about the true first state.
+def _known_ends(key: PRNGKeyArray, falls: dict[str, Array], end: str = "pose") -> _Ends:
+    """Trajectories without images, with a belief about the true first state, and the pose codes with the name `end`.
 
     In every second belief, the numbers of shape and mass have noise of random size, whose variance the belief states.
     """
@@ -293,7 +326,7 @@ def _known_ends(key: PRNGKeyArray, falls: dict[str, Array]) -> _Ends:
     mean = jnp.concatenate([code[:, : poses.CODE], noisy[:, poses.CODE :]], axis=-1)
     known = jnp.ones(number, bool)
     belief = fuse({"state": Gaussian(mean, 2 * doubt)}, {"state": known})
-    return _Ends(belief, code, falls["pose"], falls["outcome"], falls.get("condition"), known)
+    return _Ends(belief, code, falls[end], falls["outcome"], falls.get("condition"), known)
 
 
 def _end_terms(model: Model, ends: _Ends) -> dict[str, Float[Array, ""]]:
@@ -302,6 +335,45 @@ def _end_terms(model: Model, ends: _Ends) -> dict[str, Float[Array, ""]]:
     final = model.transition(ends.belief, ends.condition)
     outcome, pose = log_density(final, ends.pose, rotation_between(ends.state, ends.pose), ends.outcome)
     return {"outcome": -jnp.sum(weights * outcome), "pose": -jnp.sum(weights * pose)}
+
+
+def _step_terms(model: Model, key: PRNGKeyArray, ends: _Ends) -> dict[str, Float[Array, ""]]:
+    """The terms `outcome` and `pose` of a one-step model. Objects that have left the pad do not count."""
+    steps = _drawn_steps(key, model.config, ends)
+    counts = ends.counts & ~steps.gone
+    density = model.transition(steps.belief, steps.condition, steps.velocity)
+    numbers = poses.turn_motion_back(density.heading, steps.motion)
+    outcome, pose = _log_mixture(density, numbers, ends.outcome)
+    weights = counts / jnp.maximum(jnp.sum(counts), 1)
+    return {"outcome": -jnp.sum(weights * outcome), "pose": -jnp.sum(weights * pose)}
+
+
+def _drawn_steps(key: PRNGKeyArray, config: Config, ends: _Ends) -> _Steps:
+    """Draw a step of each trajectory: from frame 0, or from a frame with another one a step before it.
+
+    The belief about the first frame is moved to this frame. In every second step, noise is added to the true pose and
+    the velocity, so that the transition learns to correct the errors of earlier steps of a roll-out.
+    """
+    number, frames = ends.pose.shape[:2]
+    which, shift, drift = jax.random.split(key, 3)
+    place = jax.random.randint(which, (number,), 0, max(frames - 2 * config.stride, 0) + 1)
+    frame = jnp.where(place == 0, 0, place + config.stride - 1)
+
+    def at(values: Float[Array, "n f k"], frame: Int[Array, "n"]) -> Float[Array, "n k"]:
+        return jnp.take_along_axis(values, frame[:, None, None], axis=1)[:, 0]
+
+    now, after = at(ends.pose, frame), at(ends.pose, frame + config.stride)
+    velocity = poses.motion(at(ends.pose, jnp.maximum(frame - config.stride, 0)), now)
+    noise = _JITTER * (jnp.arange(number) // 2 % 2 * (frame > 0))[:, None]
+    now = poses.advanced(now, noise * jax.random.normal(shift, velocity.shape))
+    rotation = rotation_between(ends.state, now)
+    return _Steps(
+        belief=moved(ends.belief, now[:, :3], rotation),
+        velocity=velocity + noise * jax.random.normal(drift, velocity.shape),
+        motion=poses.motion(now, after),
+        condition=None if ends.condition is None else at(ends.condition, frame),
+        gone=state.gone(state.split(ends.state), config.position_scale * now[:, 2], rotation),
+    )
 
 
 def _present_pictures(

@@ -6,6 +6,9 @@ matrix, row by row.
 On a level pad, a rotation of the whole scene about the z axis changes neither gravity nor the plane of the pad. The
 transition and the decoder therefore work in a frame whose x axis is the heading, a horizontal direction that turns with
 the object. They learn motions and images for all headings at once. An angle is given by its cosine and its sine.
+
+A motion from one pose to another has 6 numbers: the difference of the position codes, then the vector of the rotation
+(rad), in the sensor frame. The motion over one step of a one-step model is its velocity.
 """
 
 import jax
@@ -16,6 +19,7 @@ from sts_jax import geometry
 
 CODE = 12  # numbers in a pose code
 MOVE = CODE + 9  # numbers in a final pose code and in the matrix of the rotation from the first to the final pose
+MOTION = 6  # numbers in a motion
 LEVEL = 0.85  # an axis is level if the length of its projection onto the pad is above this
 
 
@@ -93,3 +97,27 @@ def turn_variance(angle: Float[Array, "*#n 2"], variance: Float[Array, "*#n 12"]
 
     x, y, z, first, second, third = jnp.split(variance, [1, 2, 3, 6, 9], axis=-1)
     return jnp.concatenate([*mixed(x, y), z, *mixed(first, second), third], axis=-1)
+
+
+def motion(before: Float[Array, "*n 12"], after: Float[Array, "*n 12"]) -> Float[Array, "*n 6"]:
+    """The motion from one pose to another."""
+    turned = matrix(after) @ jnp.swapaxes(matrix(before), -1, -2)
+    vector = geometry.quat_to_rotvec(geometry.quat_from_matrix(turned))
+    return jnp.concatenate([after[..., :3] - before[..., :3], vector], axis=-1)
+
+
+def advanced(code: Float[Array, "*n 12"], move: Float[Array, "*n 6"]) -> Float[Array, "*n 12"]:
+    """Pose codes after a motion, the inverse of `motion`."""
+    turned = geometry.quat_to_matrix(geometry.quat_from_rotvec(move[..., 3:])) @ matrix(code)
+    return jnp.concatenate([code[..., :3] + move[..., :3], turned.reshape(*code.shape[:-1], 9)], axis=-1)
+
+
+def turn_motion(angle: Float[Array, "*#n 2"], move: Float[Array, "*#n 6"]) -> Float[Array, "*n 6"]:
+    """Motions after a rotation of the whole scene about the z axis of the sensor frame."""
+    along, about = turn(angle, move[..., :2]), turn(angle, move[..., 3:5])
+    return jnp.concatenate([along, move[..., 2:3], about, move[..., 5:]], axis=-1)
+
+
+def turn_motion_back(angle: Float[Array, "*#n 2"], move: Float[Array, "*#n 6"]) -> Float[Array, "*n 6"]:
+    """The inverse of `turn_motion`."""
+    return turn_motion(angle * jnp.array([1.0, -1.0]), move)

@@ -171,22 +171,43 @@ def draw(
     keys = jnp.broadcast_to(key, len(belief.mean))
     end, appearance, outline = jax.vmap(lambda key: jax.random.split(key, 3), out_axes=1)(keys)
     codes, turns = jax.vmap(functools.partial(_final_poses, num=num), out_axes=1)(end, final)
-    known = jnp.broadcast_to(belief.mean[:, : state.CODE], (drawn, len(belief.mean), state.CODE))
+    looks, level = drawn_looks(appearance, belief, drawn), drawn_levels(outline, drawn)
+    layers = rendered(model, belief, looks, codes[:drawn], turns[:drawn])
+    shown = {name: reduced(x, model.config.image_size) for name, x in empty.items()}
+    return Drawn(belief, jnp.exp(final.outcome), codes, layers, level, shown)
+
+
+def drawn_looks(key: Key[Array, "n"], belief: Gaussian, num: int) -> Float[Array, "num n look"]:
+    """Draw appearance codes of each item."""
     mean, log_var = (x[:, state.CODE :] for x in belief)
-    noise = jax.vmap(lambda key: jax.random.normal(key, (drawn, mean.shape[1])), out_axes=1)(appearance)
-    looks = mean + jnp.exp(0.5 * log_var) * noise
-    layers = model.decoder(
-        codes[:drawn].reshape(-1, poses.CODE),
-        turns[:drawn].reshape(-1, 3, 3),
+    noise = jax.vmap(lambda key: jax.random.normal(key, (num, mean.shape[1])), out_axes=1)(key)
+    return mean + jnp.exp(0.5 * log_var) * noise
+
+
+def drawn_levels(key: Key[Array, "n"], num: int) -> Float[Array, "m"]:
+    """Levels of probability above which the pixels of each of num * n sharp images are covered, see `compose`.
+
+    The levels of an item are equally spaced, in random order.
+    """
+    order = jax.vmap(lambda key: jax.random.permutation(key, num), out_axes=1)(key)
+    return (order.reshape(-1) + 0.5) / num
+
+
+def rendered(
+    model: Model,
+    belief: Gaussian,
+    looks: Float[Array, "k n look"],
+    codes: Float[Array, "k n 12"],
+    turns: Float[Array, "k n 3 3"],
+) -> Layers:
+    """Render k poses of each of n objects, from a belief about the first frames. The result has k * n items."""
+    known = jnp.broadcast_to(belief.mean[:, : state.CODE], (*codes.shape[:2], state.CODE))
+    return model.decoder(
+        codes.reshape(-1, poses.CODE),
+        turns.reshape(-1, 3, 3),
         known.reshape(-1, state.CODE),
         looks.reshape(-1, looks.shape[-1]),
     )
-    shown = {name: reduced(x, model.config.image_size) for name, x in empty.items()}
-    # An image is sharp because pixels are covered above a level of probability. The levels of an item are equally
-    # spaced, in random order.
-    order = jax.vmap(lambda key: jax.random.permutation(key, drawn), out_axes=1)(outline)
-    level = (order.reshape(-1) + 0.5) / drawn
-    return Drawn(belief, jnp.exp(final.outcome), codes, layers, level, shown)
 
 
 def _final_poses(

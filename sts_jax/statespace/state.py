@@ -12,10 +12,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from sts_jax import objects
 from sts_jax._checked import in_32_bits
+from sts_jax.physics.roll import GONE_DEPTH
 from sts_jax.statespace import harmonics, poses
 
 DEGREE = 6  # largest degree of the spherical harmonics of a support function
@@ -99,10 +100,36 @@ def turn_variance(angle: Float[Array, "n 2"], variance: State) -> State:
     )
 
 
-def reach(state: State, rotation: Float[Array, "n 3 3"]) -> Float[Array, "n"]:
-    """Height of the mesh origin above the lowest point of each object (m), after a rotation in the sensor frame."""
-    down = np.array([[0.0, 0.0, -1.0]], np.float32)
-    return LENGTH * (MEAN + harmonics.values(state.support_in_sensor[:, None], rotation, down)[:, 0, 0])
+def moved(state: State, position: Float[Array, "n 3"], rotation: Float[Array, "n 3 3"]) -> State:
+    """State codes after a rotation in the sensor frame, with other position codes. All parts may be uncertain."""
+    turned = harmonics.values(state.support_in_sensor[:, None], rotation, objects.DIRECTIONS)[:, 0] @ _fit()
+    matrix = (rotation @ poses.matrix(state.pose)).reshape(len(position), 9)
+    return state._replace(
+        pose=jnp.concatenate([position, matrix], axis=-1),
+        support_in_sensor=turned,
+        com_in_sensor=jnp.einsum("nij,nj->ni", rotation, state.com_in_sensor),
+    )
+
+
+def moved_variance(variance: State, position: float, rotation: Float[Array, "n 3 3"]) -> State:
+    """Variances of state codes after `moved`, if their numbers are independent before. `position` is a new variance.
+
+    The variances of the parts in the sensor frame stay the same.
+    """
+    matrix = (rotation**2 @ poses.matrix(variance.pose)).reshape(len(rotation), 9)
+    pose = jnp.concatenate([jnp.full_like(variance.pose[:, :3], position), matrix], axis=-1)
+    return variance._replace(pose=pose)
+
+
+def reach(state: State, rotation: Float[Array, "n 3 3"], *, up: bool = False) -> Float[Array, "n"]:
+    """How far each object reaches below (or above) its mesh origin (m), after a rotation in the sensor frame."""
+    direction = np.array([[0.0, 0.0, 1.0 if up else -1.0]], np.float32)
+    return LENGTH * (MEAN + harmonics.values(state.support_in_sensor[:, None], rotation, direction)[:, 0, 0])
+
+
+def gone(state: State, height: Float[Array, "n"], rotation: Float[Array, "n 3 3"]) -> Bool[Array, "n"]:
+    """Whether each object has left the pad and no longer moves, from the height of its mesh origin (m) and a rotation."""
+    return height + reach(state, rotation, up=True) < -GONE_DEPTH
 
 
 def heading(state: State) -> Float[Array, "n 2"]:

@@ -58,17 +58,20 @@ class Arrays:
 
     inputs: dict[str, Any]  # inputs of the model, from first frames, each a NumPy array or `Shared`
     # Targets of the model, from last frames. A state-space model also needs the state codes `state` of the first
-    # frames, pose codes `pose`, and indices `outcome` into the outcomes of the scenario.
+    # frames, pose codes `pose`, and indices `outcome` into the outcomes of the scenario. If it is a one-step model, it
+    # needs the pose codes of all frames, `course` (samples, frames, code), too.
     targets: dict[str, Any]
     # bool (samples,): True if a sample has the input. An input without a mask is present in all samples.
     present: dict[str, np.ndarray] = field(default_factory=dict)
     target_present: dict[str, np.ndarray] = field(default_factory=dict)  # the same for targets, for `mvae` models only
-    condition: np.ndarray | None = None  # (samples, condition), encoded condition of the scenario
+    # (samples, condition), encoded condition of the scenario. For a one-step state-space model, in each frame:
+    # (samples, frames, condition)
+    condition: np.ndarray | None = None
     # The other fields are for state-space models. `visual` and `tactile` image of the empty sensor, (size, size, 3)
     empty: dict[str, np.ndarray] = field(default_factory=dict)
     # First frames without a trajectory, as `visual` and `state`, (views, *shape)
     views: dict[str, np.ndarray] = field(default_factory=dict)
-    # Trajectories without images, as `state`, `pose`, `outcome` and any `condition`, (falls, *shape)
+    # Trajectories without images, as `state`, `pose` (or `course`), `outcome` and any `condition`, (falls, *shape)
     falls: dict[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -139,6 +142,9 @@ def check(model: Config, arrays: Arrays, absent: tuple[str, ...] = ()) -> None:
         inputs = {name: code if name == "pose" else size for name in model.inputs}
         targets = dict.fromkeys(statespace.IMAGES, (model.image_size, model.image_size, 3))
         targets |= {"state": (statespace.STATE_CODE,), "pose": code, "outcome": ()}
+        if model.stride:
+            frames = arrays.targets["course"].shape[1] if "course" in arrays.targets else model.stride + 1
+            targets["course"] = (max(frames, model.stride + 1), *code)
     for kind, shapes, values in (("inputs", inputs, arrays.inputs), ("targets", targets, arrays.targets)):
         actual = {name: x.shape[1:] for name, x in values.items()}
         if actual != shapes:
@@ -147,7 +153,7 @@ def check(model: Config, arrays: Arrays, absent: tuple[str, ...] = ()) -> None:
         raise ValueError(f"`outcome` has the index {highest}, but the model has {model.outcomes} outcomes")
     if not set(arrays.present) <= set(inputs):
         raise ValueError(f"`present` has masks for {list(arrays.present)}, but the inputs are {list(inputs)}")
-    width = 0 if arrays.condition is None else arrays.condition.shape[1]
+    width = 0 if arrays.condition is None else arrays.condition.shape[-1]
     if width != model.condition:
         raise ValueError(f"`condition` has width {width}, but the model has condition={model.condition}")
 
@@ -370,19 +376,22 @@ def state_arrays(
     *,
     views: Views | None = None,
     falls: Ends | None = None,
+    data: Dataset | None = None,
 ) -> Arrays:
     """Make the training arrays of a state-space model.
 
     Args:
-        pairs: From `dataset.Dataset.pairs`, with images of `model.input_size` pixels on each side.
+        pairs: From `dataset.Dataset.pairs`, with images of `model.input_size` pixels on each side. A one-step model
+            learns to render the second frame, which may be any frame.
         model: From `state_model`.
         empty: `visual` and `tactile` image of the empty sensor, uint8, from `dataset.empty_frame`.
         views: From `dataset.Dataset.views`. They are used only if `visual` is an input of the model.
         falls: Further trajectories without images, from `dataset.Dataset.ends`.
+        data: Dataset of the trajectories, for the poses in all their frames. Needed for a one-step model only.
     """
     code = np.asarray(_pose_codes(preprocessing, pairs.pose))
     last = reduced_images({"visual": pairs.visual[:, 1], "tactile": pairs.tactile[:, 1]}, model.image_size)
-    ends = _ends(pairs, code[:, 1], scenario, preprocessing)
+    ends = _ends(pairs, model, scenario, preprocessing, data)
     inputs = {"visual": pairs.visual[:, 0], "tactile": pairs.tactile[:, 0], "pose": code[:, 0]}
     felt = _touched(pairs.tactile[:, 0], preprocessing, empty["tactile"]) if "tactile" in model.inputs else None
     view_arrays, fall_arrays = {}, {}
@@ -390,11 +399,11 @@ def state_arrays(
         state = state_codes(preprocessing, views.pose, views.support, views.mass, views.com)
         view_arrays = {"visual": views.visual, "state": state}
     if falls is not None and len(falls.pose):
-        fall_arrays = _ends(falls, np.asarray(_pose_codes(preprocessing, falls.pose[:, 1])), scenario, preprocessing)
+        fall_arrays = _ends(falls, model, scenario, preprocessing, data)
     return Arrays(
         inputs={name: np.ascontiguousarray(inputs[name]) for name in model.inputs},
         condition=ends.pop("condition", None),
-        targets=last | ends,
+        targets=last | {"pose": code[:, 1]} | ends,
         present={} if felt is None else {"tactile": felt},
         empty=empty,
         views=view_arrays,
@@ -403,21 +412,44 @@ def state_arrays(
 
 
 def _ends(
-    ends: Pairs | Ends, final_pose: np.ndarray, scenario: physics.Scenario, preprocessing: Preprocessing
+    ends: Pairs | Ends,
+    model: statespace.Config,
+    scenario: physics.Scenario,
+    preprocessing: Preprocessing,
+    data: Dataset | None,
 ) -> dict[str, np.ndarray]:
-    """Codes of the first states, final pose codes, indices into `scenario.outcomes` and any encoded conditions."""
+    """Codes of the first states, final pose codes, indices into `scenario.outcomes` and any encoded conditions.
+
+    For a one-step model, they are the pose codes `course` and the conditions of all frames, and one outcome.
+    """
     numbers = np.array([int(outcome) for outcome in scenario.outcomes])
     if not np.isin(ends.outcome, numbers).all():
         raise ValueError(
             f"the trajectories have the outcomes {np.unique(ends.outcome).tolist()}, but the scenario "
             f"{type(scenario).__name__} has the outcomes {numbers.tolist()}: give the scenario of the dataset"
         )
-    condition = np.asarray(preprocessing.encode_condition(jnp.asarray(ends.condition)))
+    outcome, condition = (ends.outcome[:, None] == numbers).argmax(1), ends.condition
+    if model.stride:
+        if data is None:
+            raise ValueError("a one-step model needs the poses in all frames: give data=, the dataset of the pairs")
+        pose, time = (data.trajectory[name][ends.trajectory] for name in ("pose", "time"))
+        if model.stride >= pose.shape[1]:
+            raise ValueError(
+                f"stride is {model.stride}, but the trajectories have {pose.shape[1]} frames: give a smaller stride"
+            )
+        name, outcome = "course", np.zeros_like(outcome)
+        if condition.shape[1]:
+            passed = (time - time[:, :1])[..., None]
+            each = np.broadcast_to(condition[:, None], (*time.shape, condition.shape[1]))
+            condition = np.concatenate([each, passed], axis=2)
+    else:
+        name, pose = "pose", ends.pose[:, 1]
+    encoded = np.asarray(preprocessing.encode_condition(jnp.asarray(condition)))
     return {
         "state": state_codes(preprocessing, ends.pose[:, 0], ends.support, ends.mass, ends.com),
-        "pose": final_pose,
-        "outcome": (ends.outcome[:, None] == numbers).argmax(1).astype(np.int32),
-        **({"condition": condition} if condition.shape[1] else {}),
+        name: np.asarray(_pose_codes(preprocessing, pose)),
+        "outcome": outcome.astype(np.int32),
+        **({"condition": encoded} if encoded.shape[-1] else {}),
     }
 
 
@@ -458,6 +490,8 @@ def state_model(
     empty: dict[str, np.ndarray],
     *,
     image_size: int = 64,
+    inputs: Sequence[str] | None = None,
+    stride: int = 0,
 ) -> tuple[statespace.Config, Preprocessing]:
     """Make the configuration of a state-space model with the network sizes of the experiments.
 
@@ -465,18 +499,31 @@ def state_model(
         pairs: The training trajectories. They and `empty` are as for `state_arrays`.
         preprocessing: Its images must be square and show the whole view.
         image_size: Side of the predicted images (pixels), a divisor of the side of the input images.
+        inputs: Inputs of the model, some of `visual`, `tactile` and `pose`. None: all that the first frames have.
+        stride: Number of frames that one step of a one-step model takes. 0: the model predicts the last frame. If the
+            scenario has a condition, that of a one-step model ends with the time since the first frame (s).
 
     Returns:
-        The configuration, and the preprocessing with a new value of `absent`, as from `frame_arrays`.
+        The configuration, and the preprocessing with new values of `absent`, as from `frame_arrays`, and for a one-step
+        model of `stride`, `period` and `condition_scale`.
     """
     height, width = preprocessing.resolution
     if height != width or preprocessing.crop:
         raise ValueError(f"a state-space model needs resolution=(n, n) and crop=False, got {preprocessing}")
     absent = () if _touched(pairs.tactile[:, 0], preprocessing, empty["tactile"]).any() else ("tactile",)
+    chosen = [name for name in statespace.INPUTS if name not in absent] if inputs is None else inputs
+    if lacking := set(chosen) & set(absent):
+        raise ValueError(f"inputs has {lacking.pop()!r}, but no first frame shows a contact: leave it out")
+    if stride:
+        scale = preprocessing.condition_scale
+        preprocessing = dataclasses.replace(
+            preprocessing, stride=stride, period=stride / scenario.rate, condition_scale=(*scale, 1.0) if scale else ()
+        )
     model = statespace.Config(
-        inputs=tuple(name for name in statespace.INPUTS if name not in absent),
-        outcomes=len(scenario.outcomes),
-        outcome_names=tuple(scenario.named(int(outcome)) for outcome in scenario.outcomes),
+        inputs=tuple(chosen),
+        outcomes=1 if stride else len(scenario.outcomes),
+        outcome_names=() if stride else tuple(scenario.named(int(outcome)) for outcome in scenario.outcomes),
+        stride=stride,
         condition=len(preprocessing.condition_scale),
         vectors=scenario.vectors if scenario.quantities else 1,
         input_size=height,

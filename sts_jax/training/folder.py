@@ -427,6 +427,8 @@ def calibrate(workdir: str | os.PathLike[str], arrays: Arrays) -> Model:
     model = load(path, calibrated=False)
     if not isinstance(model.config, statespace.Config):
         raise ValueError(f"{path} has an mvae model, but only a state-space model can be calibrated")
+    if model.config.stride:
+        raise ValueError(f"{path} has a one-step model, whose density of a step is not calibrated: leave this out")
     check(model.config, arrays)
     checksum = arrays.checksum()
     with contextlib.suppress(storage.DamagedFileError):  # it is fitted again

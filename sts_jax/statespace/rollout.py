@@ -1,0 +1,191 @@
+"""Roll-outs of one-step models: courses of poses from the belief about the first frame, and their images.
+
+A course is k poses that follow each other. Each step draws a motion from the density that the transition predicts. The
+belief about the first frame is moved along the course, so that its uncertainty about shape and rotation stays the same.
+The decoder runs after the roll-out, and only for the frames that are asked for, because an image costs much more than a
+step, and convolutions in `lax.scan` are slow on a CPU.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from sts_jax import geometry
+from sts_jax._checked import in_32_bits
+from sts_jax.mvae import Gaussian
+from sts_jax.statespace import poses, state
+from sts_jax.statespace.networks import CONTRAST, FinalPose, Model, compose, experts, fuse, moved, of_state, reduced
+from sts_jax.statespace.predict import drawn_levels, drawn_looks, rendered
+
+
+class Rollout(NamedTuple):
+    """k courses of `steps` steps for each of n objects, without frame 0."""
+
+    belief: Gaussian  # posterior of the state code and the appearance code of the first frame, (n, code + look)
+    pose: Float[Array, "steps k n 12"]  # pose codes
+    turn: Float[Array, "steps k n 3 3"]  # rotation matrices from the first frame
+
+
+class _Course(NamedTuple):
+    """The moving part of the state of k courses for each of n objects."""
+
+    position: Float[Array, "k n 3"]  # position codes
+    turn: Float[Array, "k n 4"]  # quaternion of the rotation since the first frame
+    velocity: Float[Array, "k n 6"]  # motion over the last step
+
+
+@in_32_bits
+def rollout(
+    graphdef: nnx.GraphDef[Model],
+    params: nnx.State,
+    key: Key[Array, "..."] | None,
+    inputs: dict[str, Array],
+    present: dict[str, Bool[Array, "n"]],
+    empty: dict[str, Float[Array, "size size 3"]],
+    condition: Float[Array, "n steps c"] | None = None,
+    *,
+    steps: int,
+    num: int = 1,
+) -> Rollout:
+    """Roll out a one-step model from inputs of the first frame.
+
+    Each course begins at a pose that is drawn from the belief, at rest. An object that has left the pad keeps its pose,
+    as in the simulation.
+
+    Args:
+        key: As in `sample`, for n items. None for courses without random draws: they begin at the mean pose, and each
+            step is the mean of the likeliest component of the density.
+        condition: From `training.Preprocessing.encode_condition`, at the beginning of each step, or None.
+        steps: Number of steps.
+        num: Number of courses of each item.
+
+    The other arguments are those of `sample`.
+    """
+    model = nnx.merge(graphdef, params)
+    if not model.config.stride:
+        raise ValueError("the model predicts the last frame: train a one-step model (stride >= 1), or use `sample`")
+    belief = fuse(experts(model, inputs, present, empty), present)
+    known = of_state(belief)
+    keys = None if key is None else jax.vmap(lambda key: jax.random.split(key, 2), out_axes=1)(_each(key, known))
+    first = _first_poses(None if keys is None else keys[0], known, num)
+    still = _Course(
+        position=first[..., :3],
+        turn=jnp.broadcast_to(jnp.array([1.0, 0, 0, 0]), (*first.shape[:2], 4)),
+        velocity=jnp.zeros((*first.shape[:2], poses.MOTION)),
+    )
+
+    def advance(course: _Course, given: tuple[Int[Array, ""], Array | None]) -> tuple[_Course, _Course]:
+        number, condition = given
+        own = None if keys is None else jax.vmap(lambda key: jax.random.fold_in(key, number))(keys[1])
+        course = step(model, own, known, course, condition)
+        return course, course
+
+    conditions = None if condition is None else jnp.swapaxes(condition, 0, 1)
+    _, courses = jax.lax.scan(advance, still, (jnp.arange(steps), conditions))
+    turn = geometry.quat_to_matrix(courses.turn)
+    matrix = (turn @ poses.matrix(first)).reshape(*turn.shape[:-2], 9)
+    return Rollout(belief, jnp.concatenate([courses.position, matrix], axis=-1), turn)
+
+
+def step(
+    model: Model,
+    key: Key[Array, "n"] | None,
+    known: Gaussian,
+    course: _Course,
+    condition: Float[Array, "n c"] | None,
+) -> _Course:
+    """Advance k courses of each item by one step.
+
+    Args:
+        key: A key for each item. None for the mean of the likeliest component.
+        known: Belief about the state code in the first frame, `(n, code)`.
+        condition: At the beginning of the step.
+    """
+    num, number = course.position.shape[:2]
+
+    def tiled(x: Float[Array, "n *m"]) -> Float[Array, "kn *m"]:
+        return jnp.tile(x, (num, *(1,) * (x.ndim - 1)))
+
+    here, turn, velocity = jax.tree.map(lambda x: x.reshape(num * number, -1), course)
+    rotation = geometry.quat_to_matrix(turn)
+    belief = jax.tree.map(tiled, known)
+    density = model.transition(
+        moved(belief, here, rotation), None if condition is None else tiled(condition), velocity
+    )
+    motion = _motions(key, density, num)
+    gone = state.gone(state.split(belief.mean), model.config.position_scale * here[:, 2], rotation)[:, None]
+    motion = jnp.where(gone, 0, motion)
+    turn = geometry.normalize(geometry.quat_multiply(geometry.quat_from_rotvec(motion[:, 3:]), turn))
+    new = _Course(here + motion[:, :3], turn, motion)
+    return jax.tree.map(lambda x: x.reshape(num, number, -1), new)
+
+
+def _motions(key: Key[Array, "n"] | None, density: FinalPose, num: int) -> Float[Array, "kn 6"]:
+    """Draw a motion of each course in the sensor frame, or return the mean of the likeliest component."""
+    weight, mean, log_var = density.weight[:, 0], density.mean[:, 0], density.log_var[:, 0]
+    if key is None:
+        chosen = jnp.argmax(weight, axis=-1)
+    else:
+        which, noise = jax.vmap(lambda key: jax.random.split(key, 2), out_axes=1)(key)
+        shares = weight.reshape(num, -1, weight.shape[-1])
+        draw = jax.vmap(lambda key, log: jax.random.categorical(key, log, axis=-1), in_axes=(0, 1), out_axes=1)
+        chosen = draw(which, shares).reshape(-1)
+    mean, log_var = (jnp.take_along_axis(x, chosen[:, None, None], axis=1)[:, 0] for x in (mean, log_var))
+    if key is not None:
+        normal = jax.vmap(lambda key: jax.random.normal(key, (num, poses.MOTION)), out_axes=1)(noise)
+        mean += jnp.exp(0.5 * log_var) * normal.reshape(mean.shape)
+    return poses.turn_motion(density.heading, mean)
+
+
+def _first_poses(key: Key[Array, "n"] | None, known: Gaussian, num: int) -> Float[Array, "num n 12"]:
+    """Draw pose codes from the belief about the first frame, or return their means, with rotations."""
+    mean, log_var = (jnp.broadcast_to(x[:, : poses.CODE], (num, len(x), poses.CODE)) for x in known)
+    if key is not None:
+        noise = jax.vmap(lambda key: jax.random.normal(key, (num, poses.CODE)), out_axes=1)(key)
+        mean += jnp.exp(0.5 * log_var) * noise
+    return poses.rigid(mean)
+
+
+@in_32_bits
+def render(
+    graphdef: nnx.GraphDef[Model],
+    params: nnx.State,
+    key: Key[Array, "..."] | None,
+    belief: Gaussian,
+    pose: Float[Array, "k n 12"],
+    turn: Float[Array, "k n 3 3"],
+    empty: dict[str, Float[Array, "size size 3"]],
+) -> tuple[dict[str, Float[Array, "k n size size 3"]], dict[str, Float[Array, "n size size 3"]]]:
+    """Render one frame of a roll-out.
+
+    Args:
+        key: As in `sample`. It draws an appearance code for each course, which is the same in all frames. None for the
+            mean appearance.
+        belief: `Rollout.belief`.
+        pose: `Rollout.pose` in this frame.
+        turn: `Rollout.turn` in this frame.
+
+    Returns:
+        The images `visual` and `tactile` of each course in [0, 1], and their means over the courses. With a key, the
+        outlines in the images of the courses are sharp.
+    """
+    model, num = nnx.merge(graphdef, params), len(pose)
+    shown = {name: reduced(x, model.config.image_size) for name, x in empty.items()}
+    if key is None:
+        looks, level = jnp.broadcast_to(belief.mean[:, state.CODE :], (*pose.shape[:2], model.config.look)), None
+    else:
+        appearance, outline = jax.vmap(lambda key: jax.random.split(key, 2), out_axes=1)(_each(key, belief))
+        looks, level = drawn_looks(appearance, belief, num), drawn_levels(outline, num)
+    layers = rendered(model, belief, looks, pose, turn)
+    sharp, soft = (
+        {name: x.reshape(*pose.shape[:2], *x.shape[1:]) for name, x in compose(layers, shown, chosen).items()}
+        for chosen in (level, None)
+    )
+    return sharp, {name: x.mean(0) for name, x in soft.items()}
+
+
+def _each(key: Key[Array, "..."], belief: Gaussian) -> Key[Array, "n"]:
+    return jnp.broadcast_to(key, len(belief.mean))
