@@ -18,7 +18,7 @@ from sts_jax import mvae, statespace, storage, training
 from sts_jax._checked import checked, in_32_bits, warn
 from sts_jax._devices import on_each_device
 from sts_jax._plausible import image_problem, order_problem, pair_problem, pose_problem
-from sts_jax.prediction import Prediction, completed, flagged, predict, predict_samples, rollout
+from sts_jax.prediction import Prediction, completed, flagged, predict, predict_samples, rollout, rollout_samples
 
 STREAMS = ("visual", "tactile")
 MODALITIES = (*STREAMS, "pose")
@@ -113,7 +113,8 @@ class Predictor:
             ) from error
         if isinstance(model.config, statespace.Config):
             size, scale = (model.config.input_size,) * 2, model.config.position_scale
-            needed = {"resolution": size, "crop": False, "rotation": "matrix", "position_scale": scale}
+            needed: dict[str, Any] = {"resolution": size, "crop": False, "rotation": "matrix", "position_scale": scale}
+            needed["stride"] = model.config.stride or None
             for field, value in needed.items():
                 if (trained := getattr(preprocessing, field)) != value:
                     raise ValueError(
@@ -214,6 +215,10 @@ class Predictor:
         `samples` are sampled courses. From the second step on, all modalities that the model predicts are its inputs,
         even if the first frame lacks some. A predicted tactile image without contact is ignored like a given one.
 
+        A state-space model infers the state from the first frame alone, in which the object is at rest. Without a key,
+        each step is the likeliest one. With `num_samples`, the result has the mean images and the central poses of the
+        sampled courses.
+
         Args:
             frame: First frame: a `Frame`, a `Prediction` of one frame, or a mapping with some of `visual`, `tactile`
                 and `pose`. Arrays and checks are those of a call.
@@ -249,7 +254,7 @@ class Predictor:
         if rolled and self.stride is None:
             raise ValueError(
                 f"{self.name} predicts the last frame, and has no steps: call it, or train a one-step model with "
-                "training.step_arrays."
+                "training.step_arrays, or training.state_model(stride=1)."
             )
         if not rolled and self.stride is not None:
             raise ValueError(
@@ -332,8 +337,10 @@ class Predictor:
                     return rollout(*arguments, steps=course.steps, last=course.last)
                 return predict(*arguments)
             inputs, present = completed(self._inputs, view.resolution, inputs, present, lead)
-            more = *shared, num_samples, lead, model.calibration
-            return predict_samples(graphdef, state, view, self._empty, inputs, present, *more)
+            arguments = graphdef, state, view, self._empty, inputs, present, *shared, num_samples, lead
+            if course is not None:
+                return rollout_samples(*arguments, steps=course.steps, last=course.last)
+            return predict_samples(*arguments, model.calibration)
 
         def of_device(given: tuple, _: tuple) -> Prediction:
             return run(given, next(iter(jax.tree.leaves(given))).shape[: len(lead)] if inputs else lead)

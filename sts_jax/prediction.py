@@ -255,6 +255,88 @@ def predict_samples(
     return result
 
 
+@functools.partial(jax.jit, static_argnames=("graphdef", "preprocessing", "num", "steps", "lead"))
+def _courses(
+    graphdef: nnx.GraphDef,
+    state: nnx.State,
+    preprocessing: training.Preprocessing,
+    empty: dict[str, Float[Array, "h w 3"]],
+    inputs: dict[str, Float[Array, "..."]],
+    present: dict[str, Bool[Array, "*n"]],
+    condition: Float[Array, "..."] | None,
+    key: Key[Array, "..."] | None,
+    *,
+    num: int,
+    steps: int,
+    lead: tuple[int, ...],
+) -> tuple[statespace.Rollout, Float[Array, "steps k n 7"], Float[Array, "steps n 7"]]:
+    """Courses of a one-step state-space model, their poses, and the centres of these poses."""
+    flat, counts = _flat(preprocessing, inputs, present, lead, empty["tactile"])
+    conditions = None
+    if condition is not None:
+        each = jnp.repeat(condition.reshape(-1, 1, condition.shape[-1]), steps, axis=1)
+        conditions = preprocessing.encode_condition(each.at[..., -1].add(preprocessing.period * jnp.arange(steps)))
+    rolled = statespace.rollout(graphdef, state, key, flat, counts, empty, conditions, steps=steps, num=num)
+    poses = preprocessing.decode_pose(rolled.pose)
+    return rolled, poses, poses[:, 0] if num == 1 else jax.vmap(_central)(poses)
+
+
+_render = jax.jit(statespace.render, static_argnames="graphdef")
+
+
+def rollout_samples(
+    graphdef: nnx.GraphDef,
+    state: nnx.State,
+    preprocessing: training.Preprocessing,
+    empty: dict[str, Float[Array, "h w 3"]],
+    inputs: dict[str, Float[Array, "..."]],
+    present: dict[str, Bool[Array, "*n"]],
+    condition: Float[Array, "..."] | None = None,
+    key: Key[Array, "..."] | None = None,
+    num_samples: int = 0,
+    lead: tuple[int, ...] = (),
+    *,
+    steps: int,
+    last: bool = False,
+) -> Prediction:
+    """Roll out a one-step state-space model, see `Predictor.rollout` and `statespace.rollout`.
+
+    With samples, the images are means over the sampled courses, and the poses are their centres, as in
+    `predict_samples`. Without samples, there is one course: that of the likeliest steps, or with a key a sampled one.
+
+    Args:
+        condition: Conditions in SI units, of which the last number is the time of the first frame (s), or None.
+        last: True to return the last step only, with an axis of time of length 1.
+
+    The other arguments are those of `predict_samples`.
+    """
+    key = None if key is None else key.reshape(-1)
+    given = empty, inputs, present, condition, key
+    rolled, poses, centre = _courses(
+        graphdef, state, preprocessing, *given, num=num_samples or 1, steps=steps, lead=lead
+    )
+    shown = range(steps)[-1:] if last else range(steps)
+    frames = [_render(graphdef, state, key, rolled.belief, rolled.pose[i], rolled.turn[i], empty) for i in shown]
+
+    def in_time(each: list[Array], axes: int) -> Array:
+        """Stack an array for each frame, with the axes (*axes, items, ...), on an axis behind that of the items."""
+        stacked = jnp.stack(each, axis=axes + 1)
+        return stacked.reshape(*stacked.shape[:axes], *lead, *stacked.shape[axes + 1 :])
+
+    def prediction(images: list[dict[str, Array]], poses: Array, axes: int) -> Prediction:
+        code = [jnp.stack([x] * len(shown), axis=1).reshape(*lead, len(shown), -1) for x in rolled.belief]
+        streams = {name: in_time([image[name] for image in images], axes) for name in statespace.IMAGES}
+        return Prediction(**streams, pose=in_time([poses[i] for i in shown], axes), mean=code[0], log_var=code[1])
+
+    of_courses = prediction([sharp for sharp, _ in frames], poses, 1)
+    if num_samples:
+        return prediction([soft for _, soft in frames], centre, 0)._replace(samples=of_courses)
+    only: Prediction = of_courses._replace(
+        visual=of_courses.visual[0], tactile=of_courses.tactile[0], pose=of_courses.pose[0]
+    )
+    return only
+
+
 def _central(poses: Float[Array, "k n 7"]) -> Float[Array, "n 7"]:
     """Centre of k sampled poses, for each of n items, see `predict_samples`."""
     place, quat = poses[..., :3], poses[..., 3:]

@@ -123,13 +123,13 @@ def trajectories(condition):
     given = {"condition": condition, "outcome": np.array([0, 1, 1, 0], np.int32)}
     time = np.broadcast_to(0.032 * np.arange(TIMES, dtype=np.float32), (COUNT, TIMES))
     nothing = dict.fromkeys(("frames", "shard_of", "record_of", "view_shard_of", "view_record_of"), np.zeros(0, int))
-    data = dataset.Dataset(
-        {}, "", {}, {"pose": pose, "time": time, **given}, {}, solid, {}, shards=(), **nothing
-    )
+    data = dataset.Dataset({}, "", {}, {"pose": pose, "time": time, **given}, {}, solid, {}, shards=(), **nothing)
     images = rng.integers(0, 256, (2, COUNT, 2, SIDE, SIDE, 3)).astype(np.uint8)
     ends = {"pose": pose[:, [0, -1]], **given, **solid, "object": np.arange(COUNT), "trajectory": np.arange(COUNT)}
     shows = np.ones((COUNT, 2), bool)
-    pairs = dataset.Pairs(*images, segmentation=np.broadcast_to(shows[..., None, None], images.shape[1:5]), contact=shows, **ends)
+    pairs = dataset.Pairs(
+        *images, segmentation=np.broadcast_to(shows[..., None, None], images.shape[1:5]), contact=shows, **ends
+    )
     return pairs, dataset.Ends(**ends), data
 
 
@@ -160,7 +160,14 @@ def test_a_one_step_model_gets_the_poses_and_conditions_of_all_frames():
         ({"data": None}, "a one-step model needs the poses in all frames: give data="),
         ({"model": dataclasses.replace(model, stride=TIMES)}, "stride is 9, but the trajectories have 9 frames"),
     ):
-        given = {"pairs": pairs, "model": model, "scenario": scenario, "preprocessing": own, "empty": empty, "data": data}
+        given = {
+            "pairs": pairs,
+            "model": model,
+            "scenario": scenario,
+            "preprocessing": own,
+            "empty": empty,
+            "data": data,
+        }
         with pytest.raises(ValueError, match=message):
             training.state_arrays(**given | change)
     final, same = made(inputs=("tactile",))

@@ -33,7 +33,7 @@ _LOG_VAR_LIMIT = 8.0  # largest absolute value of an encoder's log variances
 _FINAL_LOG_VAR = (-3.0, 5.0)  # range of the log variances of the final pose: its centre and half of its width
 _STEP_LOG_VAR = (-8.0, 7.0)  # the same for the motion over one step: from 0.03 mm to 30 mm
 _STEP = 0.1  # unit of the correction of a constant velocity, in numbers of a motion
-_SLOW = 20.0  # factor of a velocity whose saturated value is a further input. It separates slow objects from resting ones
+_SLOW = 20.0  # factor of the velocity in a further, saturated input, which separates slow from resting objects
 _OUTSIDE = 8.0  # difference of the logit of being covered by the object, between inside and outside of the canvas
 # The tint describes the mean colour of the object in the visual image. For each colour channel, it is the mean change
 # from the empty sensor over the pixels that show the object, minus _MIDDLE, divided by _WIDTH. The tint has
@@ -234,7 +234,9 @@ class Encoder(nnx.Module):
 class Transition(nnx.Module):
     """Predicts the density of the final pose from the state in the first frame, or that of a step from any state.
 
-    The mean of a step is the velocity plus a learnt correction, as if inertia alone moved the object. The appearance code is not an input. Otherwise, the transition would recognise training objects by their appearance
+    The mean of a step is the velocity plus a learnt correction, as if inertia alone moved the object.
+
+    The appearance code is not an input. Otherwise, the transition would recognise training objects by their appearance
     (see docs/trials.md).
     """
 

@@ -6,7 +6,7 @@ The decoder runs after the roll-out, and only for the frames that are asked for,
 step, and convolutions in `lax.scan` are slow on a CPU.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from sts_jax import geometry
 from sts_jax._checked import in_32_bits
 from sts_jax.mvae import Gaussian
 from sts_jax.statespace import poses, state
-from sts_jax.statespace.networks import CONTRAST, FinalPose, Model, compose, experts, fuse, moved, of_state, reduced
+from sts_jax.statespace.networks import FinalPose, Model, compose, experts, fuse, moved, of_state, reduced
 from sts_jax.statespace.predict import drawn_levels, drawn_looks, rendered
 
 
@@ -69,8 +69,8 @@ def rollout(
         raise ValueError("the model predicts the last frame: train a one-step model (stride >= 1), or use `sample`")
     belief = fuse(experts(model, inputs, present, empty), present)
     known = of_state(belief)
-    keys = None if key is None else jax.vmap(lambda key: jax.random.split(key, 2), out_axes=1)(_each(key, known))
-    first = _first_poses(None if keys is None else keys[0], known, num)
+    start, walk, _, _ = _keys(key, len(known.mean))
+    first = _first_poses(start, known, num)
     still = _Course(
         position=first[..., :3],
         turn=jnp.broadcast_to(jnp.array([1.0, 0, 0, 0]), (*first.shape[:2], 4)),
@@ -79,7 +79,7 @@ def rollout(
 
     def advance(course: _Course, given: tuple[Int[Array, ""], Array | None]) -> tuple[_Course, _Course]:
         number, condition = given
-        own = None if keys is None else jax.vmap(lambda key: jax.random.fold_in(key, number))(keys[1])
+        own = None if walk is None else jax.vmap(lambda key: jax.random.fold_in(key, number))(walk)
         course = step(model, own, known, course, condition)
         return course, course
 
@@ -112,9 +112,7 @@ def step(
     here, turn, velocity = jax.tree.map(lambda x: x.reshape(num * number, -1), course)
     rotation = geometry.quat_to_matrix(turn)
     belief = jax.tree.map(tiled, known)
-    density = model.transition(
-        moved(belief, here, rotation), None if condition is None else tiled(condition), velocity
-    )
+    density = model.transition(moved(belief, here, rotation), None if condition is None else tiled(condition), velocity)
     motion = _motions(key, density, num)
     gone = state.gone(state.split(belief.mean), model.config.position_scale * here[:, 2], rotation)[:, None]
     motion = jnp.where(gone, 0, motion)
@@ -174,10 +172,10 @@ def render(
     """
     model, num = nnx.merge(graphdef, params), len(pose)
     shown = {name: reduced(x, model.config.image_size) for name, x in empty.items()}
-    if key is None:
+    _, _, appearance, outline = _keys(key, len(belief.mean))
+    if appearance is None:
         looks, level = jnp.broadcast_to(belief.mean[:, state.CODE :], (*pose.shape[:2], model.config.look)), None
     else:
-        appearance, outline = jax.vmap(lambda key: jax.random.split(key, 2), out_axes=1)(_each(key, belief))
         looks, level = drawn_looks(appearance, belief, num), drawn_levels(outline, num)
     layers = rendered(model, belief, looks, pose, turn)
     sharp, soft = (
@@ -187,5 +185,8 @@ def render(
     return sharp, {name: x.mean(0) for name, x in soft.items()}
 
 
-def _each(key: Key[Array, "..."], belief: Gaussian) -> Key[Array, "n"]:
-    return jnp.broadcast_to(key, len(belief.mean))
+def _keys(key: Key[Array, "..."] | None, number: int) -> Any:
+    """Keys of each item for the first pose, the steps, the appearance and the outline, `(4, n)`, or 4 times None."""
+    if key is None:
+        return (None,) * 4
+    return jax.vmap(lambda key: jax.random.split(key, 4), out_axes=1)(jnp.broadcast_to(key, number))

@@ -389,6 +389,8 @@ def state_arrays(
         falls: Further trajectories without images, from `dataset.Dataset.ends`.
         data: Dataset of the trajectories, for the poses in all their frames. Needed for a one-step model only.
     """
+    if model.stride and pairs.frame is not None and pairs.frame[:, 0].any():
+        raise ValueError("the first frames of the pairs are not frame 0, where a one-step model begins: frames=(0, k)")
     code = np.asarray(_pose_codes(preprocessing, pairs.pose))
     last = reduced_images({"visual": pairs.visual[:, 1], "tactile": pairs.tactile[:, 1]}, model.image_size)
     ends = _ends(pairs, model, scenario, preprocessing, data)
