@@ -255,7 +255,7 @@ def coasting(rng, number, frames=16):
     acceleration = rng.uniform(-1, 1, (number, 2))  # m/s^2
     early = np.minimum(time, 0.2)
     path = acceleration[:, None] * (early**2 / 2 + 0.2 * (time - early))[None, :, None]
-    start = rng.uniform(-0.02, 0.02, (number, 3)) + [0, 0, 0.15]
+    start = rng.uniform([-0.02, -0.02, 0.13], [0.02, 0.02, 0.17], (number, 3))
     drop = np.broadcast_to(-GRAVITY * time[None, :, None] ** 2 / 2, (number, frames, 1))
     position = start[:, None] + np.concatenate([path, drop], axis=2)
     matrix = np.broadcast_to(np.eye(3).ravel(), (number, frames, 9))

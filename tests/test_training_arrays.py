@@ -172,5 +172,5 @@ def test_a_one_step_model_gets_the_poses_and_conditions_of_all_frames():
             training.state_arrays(**given | change)
     final, same = made(inputs=("tactile",))
     assert (final.stride, final.condition, final.inputs, same) == (0, 3, ("tactile",), view)
-    with pytest.raises(ValueError, match="needs shape|`inputs`"):
+    with pytest.raises(ValueError, match="the samples of `inputs` have the shapes"):
         training.arrays.check(final, arrays)
