@@ -128,7 +128,7 @@ def reach(state: State, rotation: Float[Array, "n 3 3"], *, up: bool = False) ->
 
 
 def gone(state: State, height: Float[Array, "n"], rotation: Float[Array, "n 3 3"]) -> Bool[Array, "n"]:
-    """Whether each object has left the pad and no longer moves, at a height of its mesh origin (m), after a rotation."""
+    """Whether each object has left the pad and no longer moves, from the height of its origin (m) and its rotation."""
     return height + reach(state, rotation, up=True) < -GONE_DEPTH
 
 
