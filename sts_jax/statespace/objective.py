@@ -52,9 +52,10 @@ from sts_jax.statespace.networks import (
 )
 
 _LEAST = 1 / 1020  # rendered images are clipped to this distance from 0 and 1
-# Standard deviation of the noise in the poses and velocities from which a one-step model learns, as motions: 0.2 mm for
-# a position scale of 50 mm, and 0.3 degrees
-_JITTER = np.repeat(np.float32([0.004, 0.005]), 3)
+# Standard deviations of the noise in the velocities and poses from which a one-step model learns, as motions: 0.2 mm
+# for a position scale of 50 mm, and 0.3 degrees. Poses have noise in height and lean only, which contacts determine
+_JITTER = np.float32([0.004, 0.004, 0.004, 0.005, 0.005, 0.005])
+_JITTER_OF_POSE = _JITTER * np.float32([0, 0, 1, 1, 1, 0])
 
 
 def log_density(
@@ -351,12 +352,14 @@ def _step_terms(model: Model, key: PRNGKeyArray, ends: _Ends) -> dict[str, Float
 def _drawn_steps(key: PRNGKeyArray, config: Config, ends: _Ends) -> _Steps:
     """Draw a step of each trajectory: from frame 0, or from a frame with another one a step before it.
 
+    Early frames are drawn more often (frame t with a density that falls as `t**-0.5`), because most objects soon rest.
     The belief about the first frame is moved to this frame. In every second step, noise is added to the true pose and
     the velocity, so that the transition learns to correct the errors of earlier steps of a roll-out.
     """
     number, frames = ends.pose.shape[:2]
     which, shift, drift = jax.random.split(key, 3)
-    place = jax.random.randint(which, (number,), 0, max(frames - 2 * config.stride, 0) + 1)
+    count = max(frames - 2 * config.stride, 0) + 1
+    place = jnp.minimum((count * jax.random.uniform(which, (number,)) ** 2).astype(int), count - 1)
     frame = jnp.where(place == 0, 0, place + config.stride - 1)
 
     def at(values: Float[Array, "n f k"], frame: Int[Array, "n"]) -> Float[Array, "n k"]:
@@ -364,12 +367,12 @@ def _drawn_steps(key: PRNGKeyArray, config: Config, ends: _Ends) -> _Steps:
 
     now, after = at(ends.pose, frame), at(ends.pose, frame + config.stride)
     velocity = poses.motion(at(ends.pose, jnp.maximum(frame - config.stride, 0)), now)
-    noise = _JITTER * (jnp.arange(number) // 2 % 2 * (frame > 0))[:, None]
-    now = poses.advanced(now, noise * jax.random.normal(shift, velocity.shape))
+    noisy = (jnp.arange(number) // 2 % 2 * (frame > 0))[:, None]
+    now = poses.advanced(now, noisy * _JITTER_OF_POSE * jax.random.normal(shift, velocity.shape))
     rotation = rotation_between(ends.state, now)
     return _Steps(
         belief=moved(ends.belief, now[:, :3], rotation),
-        velocity=velocity + noise * jax.random.normal(drift, velocity.shape),
+        velocity=velocity + noisy * _JITTER * jax.random.normal(drift, velocity.shape),
         motion=poses.motion(now, after),
         condition=None if ends.condition is None else at(ends.condition, frame),
         gone=state.gone(state.split(ends.state), config.position_scale * now[:, 2], rotation),

@@ -156,7 +156,7 @@ def render(
     pose: Float[Array, "k n 12"],
     turn: Float[Array, "k n 3 3"],
     empty: dict[str, Float[Array, "size size 3"]],
-) -> tuple[dict[str, Float[Array, "k n size size 3"]], dict[str, Float[Array, "n size size 3"]]]:
+) -> tuple[dict[str, Float[Array, "k n small small 3"]], dict[str, Float[Array, "n small small 3"]]]:
     """Render one frame of a roll-out.
 
     Args:
