@@ -11,7 +11,7 @@ import pytest
 from flax import nnx
 from scipy import special, stats
 from scipy.spatial.transform import Rotation
-from statespace_config import STATE, finite, random_codes, random_states, same, trajectories, unit
+from statespace_config import STATE, finite, random_codes, random_states, same, trajectories, unit, untrained
 
 from sts_jax import objects, statespace, storage
 from sts_jax.mvae import Gaussian
@@ -332,3 +332,55 @@ def test_a_config_without_a_stride_is_that_of_a_final_step_model(model, batch):
     one = {"state": jnp.ones(NUMBER, bool)}
     with pytest.raises(ValueError, match="predicts the last frame: train a one-step model"):
         statespace.rollout(*final, None, {"state": batch["targets"]["state"]}, one, batch["empty"], steps=2)
+
+
+SCALE_OF_CONDITION = (10.0, 10.0, 1.0)
+STEP_VIEW = {"stride": 1, "period": 0.1, "condition_scale": SCALE_OF_CONDITION}
+GIVEN_CONDITION = np.array([[5.0, -2.0], [1.0, 3.0]], np.float32)
+
+
+@pytest.fixture(scope="module")
+def predictor():
+    return untrained(dataclasses.replace(CONFIG, inputs=("visual", "pose")), **STEP_VIEW)
+
+
+def first_frames():
+    rng = np.random.default_rng(0)
+    pose = np.concatenate([rng.uniform(-0.02, 0.02, (2, 2)), np.full((2, 1), 0.05), np.eye(4)[[0, 1]]], axis=1)
+    return {"visual": rng.random((2, 32, 32, 3), np.float32), "pose": pose.astype(np.float32)}
+
+
+@pytest.mark.filterwarnings("ignore:(visual|tactile|pose) ")
+def test_a_predictor_rolls_out_with_the_time_of_each_step(predictor):
+    given, view = first_frames(), predictor.preprocessing
+    out = predictor.rollout(given, 3, condition=GIVEN_CONDITION, time=0.2)
+    each = np.repeat(GIVEN_CONDITION[:, None], 3, axis=1) / 10
+    condition = np.concatenate([each, np.broadcast_to(0.2 + 0.1 * np.arange(3)[:, None], (2, 3, 1))], axis=2)
+    inputs = {"visual": given["visual"], "pose": view.encode_pose(given["pose"])}
+    parts = predictor.model.graphdef, predictor.model.state, None, inputs, dict.fromkeys(inputs, np.ones(2, bool))
+    empty = {name: jnp.asarray(image) for name, image in predictor.empty.items()}
+    rolled = statespace.rollout(*parts, empty, jnp.asarray(condition, jnp.float32), steps=3)
+    expected = view.decode_pose(jnp.moveaxis(rolled.pose[:, 0], 0, 1))
+    np.testing.assert_allclose(out.pose, expected, atol=1e-5)
+    assert np.abs(np.diff(out.pose, axis=1)).max((0, 2)).min() > 1e-5
+    assert out.visual.shape == out.tactile.shape == (2, 3, 16, 16, 3)
+    assert out.mean.shape == (2, 3, rolled.belief.mean.shape[1])
+    assert out.samples is out.outcome_probability is None
+    last = predictor.rollout(given, 3, condition=GIVEN_CONDITION, time=0.2, last=True)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b[:, 2:], atol=1e-5), last, out)
+
+
+@pytest.mark.filterwarnings("ignore:(visual|tactile|pose) ")
+def test_samples_of_a_predictor_are_courses_with_mean_images_and_central_poses(predictor):
+    known = {"condition": GIVEN_CONDITION, "key": jax.random.key(2), "num_samples": 3}
+    out = predictor.rollout(first_frames(), 2, **known)
+    assert out.samples.visual.shape == (3, 2, 2, 16, 16, 3)
+    assert out.samples.pose.shape == (3, 2, 2, 7)
+    quats = np.abs(np.einsum("sntq,ntq->snt", out.samples.pose[..., 3:], out.pose[..., 3:]))
+    np.testing.assert_allclose(quats.max(0), 1, atol=1e-5)  # the orientation is that of a sample
+    assert (np.abs(out.samples.pose[..., :3] - out.pose[..., :3]).max(0) > 0).any()
+    one = predictor.rollout(first_frames(), 2, **known | {"num_samples": 0})
+    assert one.pose.shape == (2, 2, 7)
+    alone = {name: value[1] for name, value in first_frames().items()}
+    found = predictor.rollout(alone, 2, **known | {"condition": GIVEN_CONDITION[1]})
+    np.testing.assert_allclose(found.pose, out.pose[1], atol=1e-5)
