@@ -337,10 +337,11 @@ class Predictor:
                     return rollout(*arguments, steps=course.steps, last=course.last)
                 return predict(*arguments)
             inputs, present = completed(self._inputs, view.resolution, inputs, present, lead)
-            arguments = graphdef, state, view, self._empty, inputs, present, *shared, num_samples, lead
+            more = *shared, num_samples, lead
+            own = graphdef, state, view, self._empty, inputs, present
             if course is not None:
-                return rollout_samples(*arguments, steps=course.steps, last=course.last)
-            return predict_samples(*arguments, model.calibration)
+                return rollout_samples(*own, *more, steps=course.steps, last=course.last)
+            return predict_samples(*own, *more, model.calibration)
 
         def of_device(given: tuple, _: tuple) -> Prediction:
             return run(given, next(iter(jax.tree.leaves(given))).shape[: len(lead)] if inputs else lead)

@@ -324,17 +324,18 @@ def rollout_samples(
         return stacked.reshape(*stacked.shape[:axes], *lead, *stacked.shape[axes + 1 :])
 
     def prediction(images: list[dict[str, Array]], poses: Array, axes: int) -> Prediction:
-        code = [jnp.stack([x] * len(shown), axis=1).reshape(*lead, len(shown), -1) for x in rolled.belief]
-        streams = {name: in_time([image[name] for image in images], axes) for name in statespace.IMAGES}
-        return Prediction(**streams, pose=in_time([poses[i] for i in shown], axes), mean=code[0], log_var=code[1])
+        return Prediction(
+            visual=in_time([image["visual"] for image in images], axes),
+            tactile=in_time([image["tactile"] for image in images], axes),
+            pose=in_time([poses[i] for i in shown], axes),
+            mean=in_time([rolled.belief.mean] * len(shown), 0),
+            log_var=in_time([rolled.belief.log_var] * len(shown), 0),
+        )
 
-    of_courses = prediction([sharp for sharp, _ in frames], poses, 1)
     if num_samples:
-        return prediction([soft for _, soft in frames], centre, 0)._replace(samples=of_courses)
-    only: Prediction = of_courses._replace(
-        visual=of_courses.visual[0], tactile=of_courses.tactile[0], pose=of_courses.pose[0]
-    )
-    return only
+        samples = prediction([sharp for sharp, _ in frames], poses, 1)
+        return prediction([soft for _, soft in frames], centre, 0)._replace(samples=samples)
+    return prediction([jax.tree.map(lambda x: x[0], sharp) for sharp, _ in frames], poses[:, 0], 0)
 
 
 def _central(poses: Float[Array, "k n 7"]) -> Float[Array, "n 7"]:

@@ -54,8 +54,8 @@ from sts_jax.statespace.networks import (
 _LEAST = 1 / 1020  # rendered images are clipped to this distance from 0 and 1
 # Standard deviations of the noise in the velocities and poses from which a one-step model learns, as motions: 0.2 mm
 # for a position scale of 50 mm, and 0.3 degrees. Poses have noise in height and lean only, which contacts determine
-_JITTER = np.float32([0.004, 0.004, 0.004, 0.005, 0.005, 0.005])
-_JITTER_OF_POSE = _JITTER * np.float32([0, 0, 1, 1, 1, 0])
+_JITTER = np.array([0.004, 0.004, 0.004, 0.005, 0.005, 0.005], np.float32)
+_JITTER_OF_POSE = _JITTER * np.array([0, 0, 1, 1, 1, 0], np.float32)
 
 
 def log_density(
