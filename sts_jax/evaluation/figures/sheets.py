@@ -1,6 +1,7 @@
 """Sheets of predictions as in the paper: a column for each held-out trajectory, and a row for each kind of image."""
 
 import io
+import math
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -224,7 +225,9 @@ def _sheet(
     wrapped = textwrap.fill(title, int(13 * width / scale))  # about thirteen letters fit into an inch
     above = scale * _LINE * (2.8 + wrapped.count("\n") + max(head.count("\n") for head in heads))
     images = sum(len(rows) * (_SIDE + _GAP) + _APART for rows in groups)
-    height = above + images + (0 if pose is None else _TALL + scale * _LEGEND)
+    legend = _legend(outlines)
+    lines = math.ceil(len(legend) / max(int(width / scale), 2))  # an entry needs about an inch
+    height = above + images + (0 if pose is None else _TALL + scale * (_LEGEND + _LINE * (lines - 1)))
     figure = plt.figure(figsize=(width, height))
 
     def left(column: int) -> float:
@@ -261,7 +264,8 @@ def _sheet(
         name("pose", top + _TALL / 2, "black")
         for column in range(len(heads)):
             pose(add(column, top, _TALL), column)
-        _legend(figure, outlines, scale * _FONT)
+        look = {"fontsize": scale * _FONT, "ncols": math.ceil(len(legend) / lines), "labelspacing": 0.2}
+        figure.legend(handles=legend, loc="lower center", frameon=False, borderaxespad=0.2, **look)
     _save(figure, path)
 
 
@@ -298,7 +302,7 @@ def _draw_pose(axis: Axes, size: np.ndarray, true: np.ndarray, predicted: np.nda
     axis.spines[:].set(color="0.8", linewidth=0.8)
 
 
-def _legend(figure: plt.Figure, outlines: bool, fontsize: float) -> None:
+def _legend(outlines: bool) -> list[Artist]:
     handles: list[Artist] = [
         Line2D([], [], color="0.3", linewidth=3.2, alpha=0.55, label="predicted frame"),
         Line2D([], [], color="0.3", linewidth=1.3, linestyle=(0, (2.2, 1.1)), label="true frame"),
@@ -307,9 +311,7 @@ def _legend(figure: plt.Figure, outlines: bool, fontsize: float) -> None:
     if outlines:
         handles.insert(1, Patch(facecolor="none", edgecolor=_PREDICTED, label="predicted outline"))
         handles.insert(3, Patch(facecolor="0.75", edgecolor=_TRUE, label="true outline"))
-    figure.legend(
-        handles=handles, loc="lower center", ncols=len(handles), fontsize=fontsize, frameon=False, borderaxespad=0.2
-    )
+    return handles
 
 
 def _save(figure: plt.Figure, path: Path) -> None:
