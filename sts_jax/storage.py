@@ -339,12 +339,13 @@ def lock(folder: Path, *, finished: bool = False) -> Iterator[None]:
 
 def _delete_partial(folder: Path) -> None:
     """Delete unfinished files and folders, except in folders below that have a lock of their own."""
-    for path in list(folder.iterdir()):
-        is_folder = path.is_dir() and not path.is_symlink()
-        if path.name.startswith(".") and path.suffix == ".partial":
-            shutil.rmtree(path, ignore_errors=True) if is_folder else path.unlink(missing_ok=True)
-        elif is_folder and not (path / ".lock").exists():
-            _delete_partial(path)
+    with contextlib.suppress(OSError):  # a folder of another user
+        for path in list(folder.iterdir()):
+            is_folder = path.is_dir() and not path.is_symlink()
+            if path.name.startswith(".") and path.suffix == ".partial":
+                shutil.rmtree(path, ignore_errors=True) if is_folder else path.unlink(missing_ok=True)
+            elif is_folder and not (path / ".lock").exists():
+                _delete_partial(path)
 
 
 def flush_folder(folder: Path) -> None:

@@ -66,6 +66,20 @@ def test_usable_objects_and_others_are_listed(folder):
     assert dataset.survey_meshes(folder, SCENARIO)[0].digest != meshes.digest
 
 
+def test_the_limits_follow_the_pad_of_the_sensor(tmp_path):
+    """A box of 60 mm is scaled down for a pad of 50 mm, a cube of 3 mm is accepted there, and one of 10 mm as well."""
+    for side in (3, 10, 60):
+        trimesh.creation.box([side * 1e-3] * 3).export(tmp_path / f"{side:02d}.stl")
+    usual, _ = dataset.survey_meshes(tmp_path, SCENARIO)
+    assert usual.names == ("10.stl", "60.stl")
+    meshes, listing = dataset.survey_meshes(tmp_path, SCENARIO, pad=0.05)
+    assert meshes.names == ("03.stl", "10.stl", "60.stl")
+    assert "scaled down to 0.04 m" in listing
+    one = dataclasses.replace(collection(meshes), num_objects=3)
+    sides = [np.ptp(body.vertices, axis=0)[0] for body in dataset.make_bodies(one, np.arange(3))]
+    np.testing.assert_allclose(sides, [0.003, 0.01, 0.04], rtol=1e-5)
+
+
 def test_one_mesh_under_several_names_is_one_object(tmp_path):
     """Otherwise it could be trained on under one name and tested on under another."""
     mesh = trimesh.creation.icosphere(2, 0.02)

@@ -17,7 +17,8 @@ import sts_jax as sts
 from benchmarks.instruments.peers import DARK, LIT, Peer, SeenLights, SensorPeer
 from experiments import commission
 from experiments.shared import commissioning
-from sts_jax import hardware
+from experiments.shared.terminal import on_one_line
+from sts_jax import hardware, storage
 from sts_jax.hardware import Device, opencv
 
 WIDTH, HEIGHT = 640, 480
@@ -173,6 +174,18 @@ def test_an_interrupted_run_resumes_and_writes_a_file_that_opens_the_sensor(peer
         pytest.raises(ValueError, match=r"board/camera.json was made with camera = .*choose another folder"),
     ):
         commissioning.claim_folder(config, camera, leds)
+
+
+def test_a_folder_has_one_user_and_leftovers_of_a_kill_are_deleted(config, monkeypatch):
+    left = config.out / "board" / ".camera.json.1.partial"
+    with storage.lock(config.out), pytest.raises(SystemExit, match="bench is in use by"), on_one_line():
+        commission.main(config)
+    left.parent.mkdir()
+    left.write_text("{")
+    monkeypatch.setattr(hardware.Leds, "connect", functools.partial(hardware.Leds.connect, timeout_s=0.1))
+    with pytest.raises(hardware.LedError):
+        commission.main(config)
+    assert not left.exists()
 
 
 def test_another_controller_on_the_port_is_refused(tmp_path, peer):

@@ -21,7 +21,7 @@ from benchmarks.instruments.peers import DARK, LIT, SIZE, SensorPeer
 from experiments import real
 from experiments.shared.page import CollectPage
 from experiments.shared.terminal import Terminal
-from sts_jax import hardware
+from sts_jax import hardware, storage
 from sts_jax.hardware import Action, Stage
 
 
@@ -210,6 +210,16 @@ def test_reviewing(workdir, capsys):
 def test_bad_options_are_named(tmp_path, options, message):
     with pytest.raises(SystemExit, match=message):
         real.main(real.Collect(tmp_path, headless=True, automatic=True, **options))
+
+
+def test_a_work_directory_has_one_user_and_leftovers_of_a_kill_are_deleted(tmp_path):
+    collect = real.Collect(tmp_path, sensor=Path("none.json"), headless=True)
+    with storage.lock(tmp_path), pytest.raises(SystemExit, match="is in use by"):
+        real.main(collect)
+    (tmp_path / ".sensor.json.1.partial").write_text("{")
+    with pytest.raises(SystemExit, match=r"none\.json"):
+        real.main(collect)
+    assert [path.name for path in tmp_path.iterdir() if path.suffix == ".partial"] == []
 
 
 def test_unknown_trajectories_and_folders_are_named(workdir, tmp_path):

@@ -96,12 +96,27 @@ def test_any_polygon_is_cut_whatever_its_plane_and_bend():
     turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     for bend, exact in ((0.0, 1e-9), (0.05, 0.05)):
         points = np.c_[star, bend * star[:, 0] ** 2] @ turn.T + 5
-        triangles = points[cut(points)]
+        triangles = points[cut(points, [len(points)])]
         area = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
         assert area.sum() / 2 == pytest.approx(shoelace(star), rel=exact)
         same = {frozenset(map(tuple, triangle)) for triangle in triangles}
         for again in (np.roll(points, 7, axis=0), points[::-1]):
-            assert {frozenset(map(tuple, triangle)) for triangle in again[cut(again)]} == same
+            assert {frozenset(map(tuple, triangle)) for triangle in again[cut(again, [len(again)])]} == same
+
+
+def test_polygons_are_cut_together_as_each_alone():
+    """Convex and concave ones of three to seven corners, a flat one, one with a NaN, and pairs without a face."""
+    rng = np.random.default_rng(0)
+    sizes = rng.integers(3, 8, 200)
+    polygons = []
+    for size in sizes:
+        angle = np.sort(rng.uniform(0, 2 * np.pi, size))
+        flat = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1) * rng.choice([1, 0.3], (size, 1), p=[0.9, 0.1])
+        polygons.append(flat[:: rng.choice([-1, 1])] @ np.linalg.qr(rng.normal(size=(3, 3)))[0])
+    polygons += [np.zeros((5, 3)), np.full((4, 3), np.nan), np.eye(3)[:2], np.zeros((0, 3)), np.eye(3)]
+    sizes = [len(polygon) for polygon in polygons]
+    alone = [start + cut(polygon, [len(polygon)]) for start, polygon in zip(np.cumsum(sizes) - sizes, polygons, strict=True)]
+    np.testing.assert_array_equal(cut(np.concatenate(polygons), sizes), np.concatenate(alone))
 
 
 def test_a_polygon_that_crosses_itself_is_refused(tmp_path):

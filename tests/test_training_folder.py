@@ -5,6 +5,7 @@ import json
 import resource
 import shutil
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -153,6 +154,16 @@ def test_a_checkpoint_of_another_model_gives_one_short_message(folder, state, ca
     assert caught.value.__suppress_context__
     assert len(capfd.readouterr().err.splitlines()) < 5
     assert int(training.restore(folder, state).step) == 4
+
+
+@pytest.mark.parametrize(("compact", "number"), [(False, np.nan), (True, -np.inf)])
+def test_weights_that_are_no_numbers_are_named_despite_their_checksum(folder, state, compact, number):
+    state = training.restore(folder, state)
+    leaves, tree = jax.tree.flatten(state.params)
+    leaves[-1] = leaves[-1].at[..., 0].set(number)
+    training.save(folder, state._replace(params=jax.tree.unflatten(tree, leaves), step=jnp.int32(5)), compact=compact)
+    with pytest.raises(ValueError, match=r"00000005 has NaN or infinite weights in params/\S+: restore it"):
+        training.load(folder)
 
 
 @pytest.mark.slow

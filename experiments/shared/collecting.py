@@ -90,6 +90,7 @@ def collect(config: Collect) -> None:
         say(f"{dataset} has {count} trajectories already")
         return
     with contextlib.ExitStack() as stack:
+        stack.enter_context(storage.lock(config.workdir))
         prepare = of_twin if config.twin else of_device
         sensor, session, someone, empty = prepare(config, dataset, stack)
         stack.enter_context(interrupts.in_order())

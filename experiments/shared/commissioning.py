@@ -89,7 +89,7 @@ def commission(config: Config) -> None:
         lens = ideal_lens(size, config.ideal_lens, simulated)
         hardware.check_view(lens, simulated.camera)
         say(f"lens: assumed without error, {config.ideal_lens:g} degrees across the diagonal, NOT calibrated")
-    with opened(config) as (camera, leds):
+    with storage.lock(config.out), opened(config) as (camera, leds):
         claim_folder(config, camera, leds)
         wait("Take everything off the pad, and leave the sensor untouched.", config.every)
         exposures = expose(config, camera, leds)

@@ -12,6 +12,7 @@ from scipy import spatial
 
 from sts_jax import objects, physics
 from sts_jax._checked import in_32_bits
+from sts_jax.objects.body import PAD
 
 SAME = 1e-5  # m, largest distance between triangles of one mesh in two file formats, which round differently
 
@@ -28,6 +29,7 @@ class Meshes:
     # length of one unit of the files (m), or pairs of the names of some and the length, None as in `survey_meshes`
     scale: float | tuple[tuple[str, float], ...] | None = None
     up: Literal["x", "y", "z"] | None = None  # axis of the files that becomes +z, None as in `survey_meshes`
+    pad: float | None = None  # width of the sensor's pad (m), None: that of the default sensor
 
 
 @in_32_bits
@@ -39,6 +41,7 @@ def survey_meshes(
     scale: float | Mapping[str, float] | None = None,
     up: Literal["x", "y", "z"] | None = None,
     parts: bool = False,
+    pad: float | None = None,
     cache: str | os.PathLike[str] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> tuple[Meshes, str]:
@@ -55,13 +58,15 @@ def survey_meshes(
             the value in ShapeNetSem's table, or 1 m for other files.
         up: The files' axis that becomes +z. Default: the axis in ShapeNetSem's table, y for glTF, z for other files.
         parts: See `Collection.parts`.
+        pad: Width of the sensor's pad (m), such as `float(min(sensor.gel.size))`. Default: that of the default sensor.
         cache: Folder that keeps the processed objects for later calls.
         progress: Called with a line of text after each object.
 
     Returns:
         The usable objects, and a text that describes each of them and the reason for each object that is left out.
     """
-    library = objects.library(folder, cache=cache, scale=scale, up=up, parts=parts)
+    width = PAD if pad is None else pad
+    library = objects.library(folder, cache=cache, scale=scale, up=up, parts=parts, pad=width)
     unknown = sorted(set(classes) - set(library.classes))
     if unknown:
         raise ValueError(f"`classes` contains {', '.join(unknown)}, but {folder} has {', '.join(library.classes)}")
@@ -89,7 +94,7 @@ def survey_meshes(
     names, labels = tuple(item.name for item in usable), tuple(item.label for item in usable)
     kept = None if cache is None else str(cache)
     stated = tuple(scale.items()) if isinstance(scale, Mapping) else scale
-    return Meshes(str(folder), names, labels, digest.hexdigest(), kept, stated, up), listing
+    return Meshes(str(folder), names, labels, digest.hexdigest(), kept, stated, up, pad), listing
 
 
 def _triangles(body: objects.Body) -> np.ndarray:
@@ -112,5 +117,6 @@ def _same(one: np.ndarray, other: np.ndarray) -> bool:
 def open_library(meshes: Meshes, parts: bool) -> tuple[objects.Library, dict[str, int]]:
     """Library of all mesh files in `meshes.folder`, and the index of each object in its items, by name."""
     scale = dict(meshes.scale) if isinstance(meshes.scale, tuple) else meshes.scale
-    library = objects.library(meshes.folder, cache=meshes.cache, scale=scale, up=meshes.up, parts=parts)
+    pad = PAD if meshes.pad is None else meshes.pad
+    library = objects.library(meshes.folder, cache=meshes.cache, scale=scale, up=meshes.up, parts=parts, pad=pad)
     return library, {item.name: index for index, item in enumerate(library.items)}

@@ -215,16 +215,13 @@ def _obj(data: bytes, files: Files) -> list[trimesh.Trimesh]:
     pictures: dict[bytes | None, Image.Image | None] = {}
     pieces = []
     for (name, has_texels), polygons in reversed(groups.items()):
-        number, coordinate = np.max([corner for polygon in polygons for corner in polygon], axis=0) + 1
+        listed = np.array([corner for polygon in polygons for corner in polygon], np.int64)
+        number, coordinate = listed.max(axis=0) + 1
         if number > len(place):
             raise Refusal(f"a face refers to vertex {number}, but the file has {len(place)} vertices: is it complete?")
         if has_texels and coordinate > len(texel):
             raise Refusal(f"a face refers to texture coordinate {coordinate} of {len(texel)}: repair it")
-        for row, polygon in enumerate(polygons):
-            if len(polygon) > 3:
-                triangles = cut(place[[corner[0] for corner in polygon], :3])
-                polygons[row] = [polygon[corner] for corner in triangles.ravel()]
-        faces = np.array([corner for polygon in polygons for corner in polygon], np.int64).reshape(-1, 3, 2)
+        faces = listed[cut(place[listed[:, 0], :3], [len(polygon) for polygon in polygons])]
         faces[..., 1] = np.where(has_texels, faces[..., 1], -1)
         used, index = np.unique(faces[..., 0] * (len(texel) + 1) + faces[..., 1] + 1, return_inverse=True)
         vertex, corner = np.divmod(used, len(texel) + 1)

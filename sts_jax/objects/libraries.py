@@ -232,7 +232,7 @@ def _entries(collection: Library, indices: Iterable[int]) -> Iterator[tuple[int,
 def _check_metres(collection: Library, span: list[tuple[float, Item]]) -> None:
     """Raise an error if the shortest and the longest of some files without a stated unit cannot both be in metres."""
     (low, short), (high, long) = span
-    if long.scale is None and (high > ROOM or (high > 1 and low <= PAD)):
+    if long.scale is None and (high > ROOM or (high > 1 and low <= collection.pad)):
         other = "" if short == long else f" and {short.name} {low:.3g} m"
         raise ValueError(
             f"{collection.folder}: in metres, {long.name} would be {high:.3g} m long{other}. Give `scale`, the length "

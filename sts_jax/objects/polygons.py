@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import ArrayLike, Float, Int
 
 from sts_jax.objects.files import Refusal
 
@@ -19,34 +19,62 @@ _CODES = {
 LONGEST = 2000  # corners of a concave polygon, whose cutting takes a time of the second order
 
 
-def cut(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "_ 3"]:
-    """Corners of the triangles of a polygon, which may be concave, slightly bent, and touch itself.
+def cut(points: Float[np.ndarray, "n 3"], sizes: ArrayLike) -> Int[np.ndarray, "_ 3"]:
+    """Cut polygons, which may be concave, slightly bent, and touch themselves. Return the corners of the triangles.
 
     All corners remain, so that neighbouring polygons still share their edges. A repetition of a polygon has the same
     triangles, also with another first corner or in the opposite direction.
+
+    Args:
+        points: Corners of all polygons, one polygon after the other.
+        sizes: Number of corners of each polygon. One of k corners has k - 2 triangles, which follow each other.
     """
-    num = len(points)
-    fan = np.stack([np.zeros(max(num - 2, 0), int), np.arange(1, num - 1), np.arange(2, num)], axis=1)
-    if num <= 3 or not np.isfinite(points).all():
-        return fan
-    ring = np.roll(np.arange(num), -np.lexsort(points.T[::-1])[0])
-    backwards = tuple(points[ring[1]]) > tuple(points[ring[-1]])
-    if backwards:
-        ring = np.roll(ring[::-1], 1)
-    corners = points[ring] - points[ring[0]]
-    wedges = np.cross(corners[1:-1], corners[2:])
-    normal = wedges.sum(axis=0)  # twice the area (Newell)
-    area, grain = np.linalg.norm(normal), 1e-12 * np.ptp(corners, axis=0).max() ** 2
-    if (wedges @ normal >= -grain * area).all() and area > grain:
-        return ring[fan[:, ::-1] if backwards else fan]  # convex
+    sizes = np.asarray(sizes, int)
+    counts = np.maximum(sizes - 2, 0)
+    starts, firsts = np.cumsum(sizes) - sizes, np.cumsum(counts) - counts
+    triangles = np.empty((counts.sum(), 3), int)
+    for size in np.unique(sizes[sizes > 2]):
+        start, first = starts[sizes == size, None], firsts[sizes == size, None]
+        triangles[first + np.arange(size - 2)] = start[..., None] + _cut_alike(points[start + np.arange(size)])
+    return triangles
+
+
+def _cut_alike(points: np.ndarray) -> np.ndarray:
+    """Cut polygons of the same number of corners, `(m, n, 3)`, into triangles `(m, n - 2, 3)`."""
+    num = points.shape[1]
+    fan = np.stack([np.zeros(num - 2, int), np.arange(1, num - 1), np.arange(2, num)], axis=1)
+    finite = np.isfinite(points).all(axis=(1, 2))
+    if num == 3 or not finite.any():
+        return np.broadcast_to(fan, (len(points), num - 2, 3))
+    places = np.where(finite[:, None, None], points, 0)
+    first = np.lexsort(np.moveaxis(places[..., ::-1], -1, 0))[:, 0]
+    ring = (first[:, None] + np.arange(num)) % num
+    rows = np.arange(len(points))
+    backwards = np.sign(places[rows, ring[:, 1]] - places[rows, ring[:, -1]]) @ [4, 2, 1] > 0
+    ring[backwards, 1:] = ring[backwards, :0:-1]
+    corners = places[rows[:, None], ring] - places[rows, first][:, None]
+    wedges = np.cross(corners[:, 1:-1], corners[:, 2:])
+    normal = wedges.sum(axis=1)  # twice the area (Newell)
+    area, grain = np.linalg.norm(normal, axis=1), 1e-12 * np.ptp(corners, axis=1).max(axis=1) ** 2
+    convex = (np.einsum("mki,mi->mk", wedges, normal) >= -(grain * area)[:, None]).all(axis=1) & (area > grain)
+    triangles = ring[:, fan]
+    for k in np.flatnonzero(finite & ~convex):
+        triangles[k] = ring[k][_cut_concave(corners[k], normal[k], area[k], grain[k], points[k, 0])]
+    triangles[backwards] = triangles[backwards][..., ::-1]
+    return np.where(finite[:, None, None], triangles, fan)
+
+
+def _cut_concave(corners: np.ndarray, normal: np.ndarray, area: float, grain: float, place: np.ndarray) -> np.ndarray:
+    """Cut a polygon by its projection along its normal, of the length `area`. `place` is for messages."""
+    num = len(corners)
     if num > LONGEST:
         raise Refusal(f"a concave face has {num:,} corners, but at most {LONGEST:,} are cut: split it into triangles")
     x, y = np.linalg.svd(normal[None])[2][1:] if area > grain else np.linalg.svd(corners, full_matrices=False)[2][:2]
     plane = corners @ np.stack([x, y if np.cross(x, y) @ normal >= 0 else -y], axis=1)
     triangles = _ears(plane, grain)
     if np.abs(_areas(plane, triangles)).sum() > (1 + 1e-3) * area + 1e6 * grain:
-        raise Refusal(f"a face of {num} corners near {points[0]} crosses itself: split it into triangles")
-    return ring[triangles[:, ::-1] if backwards else triangles]
+        raise Refusal(f"a face of {num} corners near {place} crosses itself: split it into triangles")
+    return triangles
 
 
 def _areas(plane: np.ndarray, triangles: np.ndarray) -> np.ndarray:
@@ -92,13 +120,12 @@ def cut_off(content: bytes) -> bytes:
     kind, *counts = head.split()
     if not counts:
         counts = lines.pop(0).split()
-    num, faces = int(counts[0]), []
-    vertices = lines[:num]
+    num = int(counts[0])
+    vertices, polygons = lines[:num], [line.split() for line in lines[num : num + int(counts[1])]]
     points = np.array([line.split()[:3] for line in vertices], float)
-    for line in lines[num : num + int(counts[1])]:
-        size, *rest = line.split()
-        index = np.array(rest[: int(size)], int)
-        faces += ["3 " + " ".join(map(str, index[face])) for face in cut(points[index])]
+    polygons = [polygon[1:][: int(polygon[0])] for polygon in polygons]
+    index = np.array([corner for polygon in polygons for corner in polygon], int)
+    faces = [f"3 {a} {b} {c}" for a, b, c in index[cut(points[index], list(map(len, polygons)))].tolist()]
     return "\n".join([kind, f"{num} {len(faces)} 0", *vertices, *faces]).encode("latin-1")
 
 
@@ -125,17 +152,20 @@ def cut_ply(content: bytes) -> bytes:
         return content
     names = [words[-1] for words in layout["vertex"]]
     places = np.array([[row[names.index(axis)][0] for axis in "xyz"] for row in rows["vertex"]], float)
-    triangles = []
-    for row in rows["face"]:
-        num = len(row[corners])
-        for triangle in cut(places[row[corners]]):
-            copy = list(row)
-            for k in [k for k in lists if num and len(row[k]) % num == 0]:
-                copy[k] = np.reshape(row[k], (num, -1))[triangle].ravel().tolist()
-            triangles.append(copy)
-    rows["face"] = triangles
+    sizes = np.array([len(row[corners]) for row in rows["face"]])
+    owner = np.repeat(np.arange(len(sizes)), np.maximum(sizes - 2, 0))
+    triangles = cut(places[[number for row in rows["face"] for number in row[corners]]], sizes)
+    triangles -= (np.cumsum(sizes) - sizes)[owner, None]  # corners of the polygon
+    faces = []
+    for row, triangle in zip([rows["face"][k] for k in owner], triangles.tolist(), strict=True):
+        num, copy = len(row[corners]), list(row)
+        for k in [k for k in lists if len(row[k]) % num == 0]:
+            width = len(row[k]) // num
+            copy[k] = [row[k][width * corner + j] for corner in triangle for j in range(width)]
+        faces.append(copy)
+    rows["face"] = faces
     top = [["format", "binary_little_endian", "1.0"] if words[:1] == ["format"] else words for words in lines]
-    top = [["element", "face", str(len(triangles))] if words[:2] == ["element", "face"] else words for words in top]
+    top = [["element", "face", str(len(faces))] if words[:2] == ["element", "face"] else words for words in top]
     out = ["\n".join(map(" ".join, top)).encode("latin-1"), b"\nend_header\n"]
     for name, kinds in layout.items():
         for words, value in ((words, value) for row in rows[name] for words, value in zip(kinds, row, strict=True)):

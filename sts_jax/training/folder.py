@@ -237,6 +237,9 @@ def read(folder: Path, step: int, like: TrainState) -> TrainState:
                 problem, remedy = "has no state of this optimiser", "give the optimiser that the training began with"
             reason = f"{type(error).__name__}: {_first_line(error)}"
             raise ValueError(f"{path} {problem} ({reason}): {remedy}, or choose another folder.") from None
+    for name in _plain(like._replace(optimiser=None)):
+        if not np.isfinite(loaded[name]).all():
+            raise ValueError(f"{path} has NaN or infinite weights in {name}: {_remedy(folder)}.")
     return jax.tree.unflatten(jax.tree.structure(like), [loaded[name] for name in _plain(like)])
 
 
