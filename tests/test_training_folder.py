@@ -156,6 +156,7 @@ def test_a_checkpoint_of_another_model_gives_one_short_message(folder, state, ca
     assert int(training.restore(folder, state).step) == 4
 
 
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # when weights are rounded
 @pytest.mark.parametrize(("compact", "number"), [(False, np.nan), (True, -np.inf)])
 def test_weights_that_are_no_numbers_are_named_despite_their_checksum(folder, state, compact, number):
     state = training.restore(folder, state)

@@ -2,11 +2,11 @@
 
 import io
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import ArrayLike, Float, Int
+from jaxtyping import Float, Int
 
 from sts_jax.objects.files import Refusal
 
@@ -19,7 +19,7 @@ _CODES = {
 LONGEST = 2000  # corners of a concave polygon, whose cutting takes a time of the second order
 
 
-def cut(points: Float[np.ndarray, "n 3"], sizes: ArrayLike) -> Int[np.ndarray, "_ 3"]:
+def cut(points: Float[np.ndarray, "n 3"], sizes: Sequence[int] | Int[np.ndarray, "m"]) -> Int[np.ndarray, "_ 3"]:
     """Cut polygons, which may be concave, slightly bent, and touch themselves. Return the corners of the triangles.
 
     All corners remain, so that neighbouring polygons still share their edges. A repetition of a polygon has the same
