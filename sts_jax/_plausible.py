@@ -26,8 +26,10 @@ _FEW = 0.02  # largest share of pixels of the empty sensor in an image of anothe
 _PLAIN = 0.1  # largest spread of the brightness along the border of an image with a background
 _INSIDE = 0.13  # least difference in brightness of an object from this background
 _VIVID = 0.3  # least spread of the brightness of an image that no texture explains
-_SPREAD = 0.3  # distance of a pose from the middle of the object's outline, in half sides of the outline, and
-_APART = 0.012  # m, to be added to it. Also the largest distance of a pose from an outline that the image cuts off
+# Largest distance of a pose from the middle of the object's outline along x and y, in half sides of the outline, and
+_SPREAD = 0.3
+_OFF = 0.008  # m, to be added to it
+_APART = 0.012  # m, largest distance of a pose from an outline that the image cuts off
 _ITEMS = 16  # least number of quaternions that reveals their order
 _OUTSIDE = 0.05  # largest distance of a contact from the object in the other image, in sides of the image
 _FARTHEST = 1.0  # m, largest coordinate of a pose in `sense`
@@ -141,10 +143,10 @@ def pose_problem(image: Image, blank: Image, pose: np.ndarray, distance: float, 
     size, (y, x) = len(image), np.nonzero(changed)
     seen = 0.5 + pose[:2] * distance / max(distance + pose[2], 0.2 * distance) / view  # shares of the image
     first, last = np.array([x.min(), y.min()]) / size, np.array([x.max() + 1, y.max() + 1]) / size
-    middle, half = np.array([x.mean() + 0.5, y.mean() + 0.5]) / size, (last - first).max() / 2
     beside = np.maximum(first - np.clip(seen, 0, 1), np.clip(seen, 0, 1) - last).max() * view > _APART
-    cut = first.min() == 0 or last.max() == 1
-    if beside or (not cut and np.linalg.norm(seen - middle) * view > _APART + _SPREAD * half * view):
+    middles = np.array([[x.mean() + 0.5, y.mean() + 0.5], (first + last) / 2 * size]) / size
+    off = np.abs(seen - middles).min(axis=0) - _SPREAD * (last - first) / 2
+    if beside or (off[(first > 0) & (last < 1)] * view > _OFF).any():
         return (
             "pose is not that of the object in visual: it lies beside it. Do they belong together? A pose is x, y, z "
             "(m, sensor frame) and a quaternion in the order w, x, y, z, and an image must not be mirrored."
