@@ -28,7 +28,7 @@ _INSIDE = 0.13  # least difference in brightness of an object from this backgrou
 _VIVID = 0.3  # least spread of the brightness of an image that no texture explains
 # Largest distance of a pose from the middle of the object's outline along x and y, in half sides of the outline, and
 _SPREAD = 0.3
-_OFF = 0.008  # m, to be added to it
+_OFF = 0.01  # m, to be added to it
 _APART = 0.012  # m, largest distance of a pose from an outline that the image cuts off
 _ITEMS = 16  # least number of quaternions that reveals their order
 _OUTSIDE = 0.05  # largest distance of a contact from the object in the other image, in sides of the image
