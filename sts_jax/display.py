@@ -23,7 +23,7 @@ from sts_jax.storage import DamagedFileError, write_bytes
 
 _KINDS: dict[str, type] = {kind.__name__: kind for kind in (Frame, Body, Trajectory)}
 _INCH = 2.6  # height of a panel (inches)
-_STRIP = 12.0  # width of a strip of frames (inches)
+_STRIP = 12.0  # largest width of a strip of frames (inches)
 _WIDE = 2.5  # least width of a strip in multiples of its height
 _FORMAT = 1  # version of the layout of .npz files
 
@@ -53,7 +53,8 @@ def show(thing: Frame | Body | Prediction | ArrayLike, *, title: str = "") -> Fi
     height = _INCH if len(panels) > 1 else 1.5 * _INCH
     rows, columns, size = 1, len(panels), (1.15 * height * len(panels), height + 0.4)
     if (aspect := panels[0].values.shape[1] / panels[0].values.shape[0]) > _WIDE:  # strips are stacked
-        rows, columns, size = len(panels), 1, (_STRIP, (_STRIP / aspect + 0.3) * len(panels) + 0.4)
+        width = min(_STRIP, _INCH * aspect)
+        rows, columns, size = len(panels), 1, (width, (width / aspect + 0.3) * len(panels) + 0.4)
     figure = NotebookFigure(figsize=size, layout="constrained")
     for axes, panel in zip(np.ravel(figure.subplots(rows, columns)), panels, strict=True):
         drawn = axes.imshow(panel.values, cmap=panel.colours)

@@ -41,7 +41,7 @@ def by_hand(predictor, given, steps, condition=None, time=0.0, normal=None):
         if condition is not None:
             now = np.broadcast_to(np.asarray(time + step * view.period, np.float32), len(condition))
             wide = jnp.asarray(np.column_stack([condition, now]) / np.array(SCALE), jnp.float32)
-        posterior = mvae.infer(model.graphdef, model.state, codes, present=present)
+        posterior = mvae.infer(model.graphdef, model.state, codes, present=present, condition=wide)
         z = posterior.mean if normal is None else posterior.mean + jnp.exp(posterior.log_var / 2) * normal(step)
         out = mvae.decode(model.graphdef, model.state, z, condition=wide)
         values = {name: jax.nn.sigmoid(out[name]) for name in ("visual", "tactile")}
@@ -85,9 +85,15 @@ def test_a_predicted_tactile_image_without_contact_is_ignored_like_a_given_one()
     assert np.abs(as_paper.rollout(given, 4).mean - model.rollout(given, 4).mean).max() > 1e-3
 
 
-@pytest.mark.parametrize("time", [0.0, np.array([0.2, 1.0])])
-def test_the_condition_of_each_step_has_the_time_that_has_passed(time):
-    model, given = untrained(TIMED, **STEP, condition_scale=SCALE), measurement(2)
+@pytest.mark.parametrize(
+    ("time", "config"),
+    [
+        (np.array([0.2, 1.0]), TIMED),
+        (0.0, dataclasses.replace(TIMED, encode_condition=True, prior="conditional")),
+    ],
+)
+def test_the_condition_of_each_step_has_the_time_that_has_passed(time, config):
+    model, given = untrained(config, **STEP, condition_scale=SCALE), measurement(2)
     out = model.rollout(given, 3, condition=CONDITION, time=time)
     check(out, by_hand(model, given, 3, CONDITION, time))
     assert np.abs(out.pose - model.rollout(given, 3, condition=CONDITION, time=3.0).pose).max() > 1e-3
