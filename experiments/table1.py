@@ -1,9 +1,9 @@
 """The paper's Table 1: four models of three scenarios at two time scales, and ours, with a verdict on its two claims.
 
-    python -m experiments.table1                    # about two hours on two CPU cores, can be stopped and started again
-    python -m experiments.table1 --seeds 0          # one seed, in a third of the time. More seeds may follow
-    python -m experiments.table1 --preset smoke     # about three minutes, for tests
-    python -m experiments.table1 --preset paper     # the paper's data size and training schedule: days, a GPU helps
+    python -m experiments.table1                  # about two hours on two CPU cores, 13 GB on disk, can be resumed
+    python -m experiments.table1 --seeds 0        # one seed, in a third of the time. More seeds may follow
+    python -m experiments.table1 --preset smoke   # about three minutes, for tests
+    python -m experiments.table1 --preset paper   # the paper's data size and training schedule: weeks, days on a GPU
 
 The results go to `runs/table1/`: `table1.md`, `claims.md`, `metrics.json` and figures. See `docs/experiments.md` for
 the files and the options. Every field of the configuration is an option too: `--perturbed.num-objects 100`.
@@ -33,14 +33,14 @@ COURSES = 4  # sampled courses of a state-space model whose mean images are draw
 SHEETS = ("mvae", "statespace")  # models whose predictions and roll-outs are drawn
 CROSSED = ("mvae-without-pose", "statespace")  # models that predict one stream from the other one
 
-COLLECTION = dataset.Collection(num_objects=200, num_per_object=2, shares=(0.7, 0.1, 0.2), seed=2)
+COLLECTION = dataset.Collection(num_objects=400, num_per_object=1, shares=(0.75, 0.1, 0.15), seed=2)
 DEFAULT = Config(
     freefall=dataclasses.replace(COLLECTION, scenario=physics.Freefall()),
     inclined=dataclasses.replace(COLLECTION, scenario=physics.Inclined()),
     perturbed=dataclasses.replace(COLLECTION, scenario=physics.Perturbed(), categories=("bottle",)),
     # All cells make the same number of steps with batches of the same size.
-    training=dataclasses.replace(common.TRAINING, steps=250, checkpoint_every=50),
-    state_training=dataclasses.replace(common.STATE_TRAINING, steps=250, warmup=50, checkpoint_every=50),
+    training=dataclasses.replace(common.TRAINING, steps=200, checkpoint_every=40),
+    state_training=dataclasses.replace(common.STATE_TRAINING, steps=160, warmup=30, checkpoint_every=40),
 )
 
 

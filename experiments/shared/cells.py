@@ -57,14 +57,13 @@ REFERENCES = dict(zip(("constant", "copy", "ceiling"), (*evaluation.BASELINES[:2
 SCORED = tuple(m for m in evaluation.METRICS if m.name in ("visual_bce", "tactile_bce", "position_on_pad"))
 SELECTION = ("scenarios", "models", "scales", "seeds")
 
-# Seconds on two cores of a 2.8 GHz Xeon: a gradient step of 16 samples of each of the paper's models (with and without
-# touch in the first frames) and of 32 samples of a state-space model, what a cell needs besides its steps, a rendered
-# frame of both streams with 64 x 64 pixels, and a re-roll with its frame.
+# Seconds on two cores of a 2.8 GHz Xeon, with images of 64 x 64 pixels: a gradient step of 16 samples of each of the
+# paper's models (with and without touch in the first frames) and of 32 samples of a state-space model, compilation and
+# checkpoints of a cell, a predicted frame of the paper's models and a sample of a state-space model, a rendered frame,
+# and a re-roll.
 _STEP_S = {"mvae": 0.29, "mvae-without-pose": 0.13, "vae-visual": 0.05, "vae-tactile": 0.05}
-_TOUCHLESS_STEP_S = {"mvae": 0.13, "mvae-without-pose": 0.05}
-_STATE_STEP_S = 0.25
-_CELL_S = {"final": 10.0, "step": 40.0}
-_FRAME_S, _REROLL_S = 0.01, 0.03
+_TOUCHLESS_STEP_S = {**_STEP_S, "mvae": 0.13, "mvae-without-pose": 0.05}
+_STATE_STEP_S, _CELL_S, _PREDICTED_S, _SAMPLE_S, _FRAME_S, _REROLL_S = 0.25, 15.0, 0.004, 0.005, 0.01, 0.03
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,7 +97,7 @@ class Config:
     in_memory: bool = True  # read the frames of one-step trainings into memory. False: from the disk, batch by batch
     num_validated: int = 4  # trajectories whose frames give the validation loss of the paper's one-step models
     moments: tuple[int, ...] = (0, 4, 12, 30)  # frames from which the one-step error is measured, besides the roll-out
-    num_samples: int = 16  # samples of each prediction of a state-space model, whose mean image is scored
+    num_samples: int = 8  # samples of each prediction of a state-space model, whose mean image is scored
     rerolls: int = 12  # simulations of each held-out start, whose mean is the ceiling
     num_rerolled: int = 60  # held-out starts that are re-rolled, from the first one on
 
@@ -200,20 +199,23 @@ def cells(config: Config) -> Iterator[Cell]:
 
 def estimated_s(config: Config, cell: Cell) -> float:
     """Seconds of a cell on this machine, roughly."""
-    collection = config.collection(cell.scenario)
-    share = evaluation.train_share(collection.shares, config.split)
-    samples = round(share * collection.num_trajectories)
+    collection, steps = config.collection(cell.scenario), 1
+    samples = round(evaluation.train_share(collection.shares, config.split) * collection.num_trajectories)
+    items = len(WEIGHTS) * collection.shares[2] * collection.num_trajectories
     if cell.scale == "step":
         samples *= collection.scenario.frames - config.stride
+        steps = (collection.scenario.frames - 1) // config.stride
     if cell.model in STATE:
         schedule, step_s = config.state_training, _STATE_STEP_S / 32
+        predicting_s = items * config.num_samples * _SAMPLE_S
     else:
         blank = cell.scenario in TOUCHLESS and cell.scale == "final"
-        step_s = (_TOUCHLESS_STEP_S if blank else _STEP_S).get(cell.model, _STEP_S[cell.model]) / 16
-        schedule = config.training
-    work = schedule.total(samples) * schedule.batch_size * step_s
-    shown = _size(collection) * collection.scenario.frames / 60
-    return (work * _size(collection) + _CELL_S[cell.scale] * shown) * _slower()
+        schedule, step_s = config.training, (_TOUCHLESS_STEP_S if blank else _STEP_S)[cell.model] / 16
+        predicting_s = items * steps * _PREDICTED_S
+    if cell.scale == "final":
+        predicting_s *= len(SUBSETS)
+    training_s = schedule.total(samples) * schedule.batch_size * step_s
+    return _CELL_S * _slower() + (training_s + predicting_s) * _size(collection) * _slower()
 
 
 def estimated_collecting_s(config: Config, scenario: str) -> float:
