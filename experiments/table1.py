@@ -140,11 +140,11 @@ def write(
         complete, scores = [], {}
         for seed in config.seeds:
             wanted = list(cells.cells(dataclasses.replace(config, seeds=(seed,), scenarios=(name,))))
-            paths = {cell: workdir / "scores" / f"{cell.name}.npz" for cell in wanted}
-            if all(path.exists() for path in paths.values()):
+            files = {cell: f"scores/{cell.name}.npz" for cell in wanted}
+            if all((workdir / file).exists() for file in files.values()):
                 complete.append(seed)
-                scores |= {cell: storage.read_arrays(path, f"delete {path}") for cell, path in paths.items()}
-                checksums |= storage.checksums(workdir, [p.relative_to(workdir).as_posix() for p in paths.values()])
+                scores |= {cell: storage.read_arrays(workdir / file, f"delete {file}") for cell, file in files.items()}
+                checksums |= storage.checksums(workdir, [*files.values(), f"scores/{name}/references.npz"])
         if complete:
             results.append(claims.Results(name, scene.test.object, tuple(complete), scores, references[name]))
     if not results or evaluate.stale(workdir, "results", checksums) is None:
