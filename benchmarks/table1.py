@@ -11,11 +11,12 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Any
 
+import jax
 import numpy as np
 import tyro
 
 import sts_jax as sts
-from sts_jax import dataset, evaluation, storage
+from sts_jax import dataset, evaluation, statespace, storage
 
 STREAMS = ("visual", "tactile")
 HALF_LEVEL = 1 / 510  # predicted values are limited to half a grey level from 0 and 1
@@ -34,7 +35,10 @@ class Args:
 def main(args: Args) -> str:
     """Compare the cells, and return a table. A difference above the tolerance is an error."""
     sts.enable_compilation_cache()
-    metrics = storage.read_json(args.workdir / "metrics.json", "run experiments.table1 again")
+    metrics, settings = (
+        storage.read_json(args.workdir / name, "run experiments.table1 again")
+        for name in ("metrics.json", "config.json")
+    )
     lines = ["| cell | weights | stream | metrics.json | recomputed |", "|---" * 5 + "|"]
     for name in args.cells or _one_of_each_kind(metrics):
         scenario, _, model = name.partition("/")
@@ -43,7 +47,7 @@ def main(args: Args) -> str:
         data = dataset.load(args.workdir / "datasets" / scenario)
         test = data.pairs(evaluation.rows_of(data, metrics["split"])["test"])
         for weights, folder in (("last", "."), ("best", "best")):
-            found = recomputed(args.workdir / "models" / name / folder, test)
+            found = recomputed(args.workdir / "models" / name / folder, test, settings["num_samples"])
             for stream, value in found.items():
                 stored = _stored(metrics, scenario, key, scale, int(seed), weights, stream)
                 lines.append(f"| {name} | {weights} | {stream} | {stored:.7f} | {value:.7f} |")
@@ -54,20 +58,24 @@ def main(args: Args) -> str:
     return "\n".join(lines)
 
 
-def recomputed(folder: Path, test: dataset.Pairs) -> dict[str, float]:
+def recomputed(folder: Path, test: dataset.Pairs, num_samples: int) -> dict[str, float]:
     """Mean cross-entropy of each stream (nats per pixel and channel) of a model from all its inputs."""
+    keys = jax.random.split(jax.random.key(0), len(test.object))
     predictor, total, count = sts.Predictor.load(folder), dict.fromkeys(STREAMS, 0.0), dict.fromkeys(STREAMS, 0)
     for start in range(0, len(test.object), _CHUNK):
         part = test.take(slice(start, start + _CHUNK))
         frame = {"visual": part.visual[:, 0] / 255, "tactile": part.tactile[:, 0] / 255, "pose": part.pose[:, 0]}
-        given = {name: frame[name] for name in predictor.modalities}
-        condition = part.condition if part.condition.shape[1] else None
+        given: dict[str, Any] = {name: frame[name] for name in predictor.modalities}
+        more: dict[str, Any] = {"condition": part.condition if part.condition.shape[1] else None}
+        if isinstance(predictor.model.config, statespace.Config):
+            more |= {"key": keys[start : start + _CHUNK], "num_samples": num_samples}
         if predictor.stride is not None:
+            assert part.frame is not None
             first, last = part.frame[0]
-            out = predictor.rollout(given, int(last - first) // predictor.stride, condition=condition)
+            out = predictor.rollout(given, int(last - first) // predictor.stride, **more)
             images = {name: None if (x := getattr(out, name)) is None else np.asarray(x)[:, -1] for name in STREAMS}
         else:
-            out = predictor(**given, condition=condition) if given else predictor.prior((len(part.object),))
+            out = predictor(**given, **more) if given else predictor.prior((len(part.object),))
             images = {name: getattr(out, name) for name in STREAMS}
         for stream, image in images.items():
             if image is not None:

@@ -14,7 +14,7 @@ import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 import tyro
@@ -22,7 +22,7 @@ import tyro
 import sts_jax as sts
 from experiments.shared import cells, claims, evaluate, run
 from experiments.shared import config as common
-from experiments.shared.cells import NAMES, Config
+from experiments.shared.cells import NAMES, Cell, Config
 from experiments.shared.terminal import on_one_line, say
 from sts_jax import dataset, evaluation, physics, storage
 from sts_jax.evaluation import figures
@@ -78,7 +78,7 @@ PAPER = dataclasses.replace(
     inclined=_paper(DEFAULT.inclined, 480),  # 2,400
     perturbed=_paper(DEFAULT.perturbed, 500),  # 2,500
     training=TrainConfig(epochs=200, batch_size=64, learning_rate=1e-3),
-    models=tuple(cells.PAPER),  # the state-space model needs images of the whole pad
+    models=get_args(cells.Name)[: len(cells.PAPER)],  # the state-space model needs images of the whole pad
     targets="own",
     rotation="quaternion",
     mask_blank_touch=False,
@@ -112,7 +112,7 @@ def main(config: Config, workdir: Path) -> None:
     )
     with storage.lock(workdir, finished=True):
         storage.claim(workdir / "config.json", config.claimed)
-        scenes = {name: cells.scene(config, name, sensor, workdir) for name in config.scenarios}
+        scenes: dict[str, cells.Scene] = {n: cells.scene(config, n, sensor, workdir) for n in config.scenarios}
         references = {name: cells.references(config, sensor, workdir, scene) for name, scene in scenes.items()}
         spent, expected = 0.0, 0.0
         for number, cell in enumerate(todo, 1):
@@ -135,11 +135,11 @@ def write(
     references: dict[str, cells.Scores],
 ) -> None:
     """Write the tables, the claims and the metrics from the scores of the seeds that are complete."""
-    results, checksums = [], {}
+    results, checksums, every = [], dict[str, str](), list(cells.cells(config))
     for name, scene in scenes.items():
-        complete, scores = [], {}
+        complete, scores = [], dict[Cell, cells.Scores]()
         for seed in config.seeds:
-            wanted = list(cells.cells(dataclasses.replace(config, seeds=(seed,), scenarios=(name,))))
+            wanted = [cell for cell in every if (cell.scenario, cell.seed) == (name, seed)]
             files = {cell: f"scores/{cell.name}.npz" for cell in wanted}
             if all((workdir / file).exists() for file in files.values()):
                 complete.append(seed)
@@ -218,9 +218,9 @@ def draw_scene(
         figures.models_sheet(path("models"), test, papers, some, **look, title=title)
     for model, predictor in final.items():
         if model in CROSSED and {"visual", "tactile"} <= set(predictor.modalities):
-            sides = [evaluation.predict(predictor, (name,), test, scenario) for name in ("tactile", "visual")]
+            touch, vision = (evaluation.predict(predictor, (name,), test, scenario) for name in ("tactile", "visual"))
             title = f"{scene.name}: {NAMES[model]}, each stream from the other one"
-            figures.crossed_sheet(path(f"crossed-{model}"), test, *sides, some, **look, title=title)
+            figures.crossed_sheet(path(f"crossed-{model}"), test, touch, vision, some, **look, title=title)
     few, time, curves = test.take(some), scene.data.trajectory["time"][test.trajectory[0]], {}
     for model in (model for model in SHEETS if model in step):
         stride = step[model].stride or 1

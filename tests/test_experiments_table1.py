@@ -298,7 +298,7 @@ def discs(rng, count, side=32):
 @pytest.mark.parametrize("shuffled", [False, True])
 def test_shuffled_targets_give_no_skill(shuffled, tmp_path):
     rng = np.random.default_rng(0)
-    train, test, blank = discs(rng, 512), discs(rng, 64), np.full((32, 32, 3), 180, np.uint8)
+    train, test, blank = discs(rng, 4096), discs(rng, 64), np.full((32, 32, 3), 180, np.uint8)
     if shuffled:
         train[:, 1] = train[rng.permutation(len(train)), 1]
     arrays, view = training.image_arrays(train, train, ("visual",), training.Preprocessing((32, 32)), blank)

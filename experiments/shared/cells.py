@@ -8,7 +8,7 @@ import dataclasses
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import jax
 import numpy as np
@@ -78,7 +78,7 @@ class Config:
     state_training: TrainConfig  # training of each state-space model
     # the cells that are computed. These four may change from one run to the next in the same work directory
     scenarios: tuple[Scenario, ...] = ("freefall", "inclined", "perturbed")
-    models: tuple[Name, ...] = (*PAPER, *STATE)  # type: ignore[assignment]
+    models: tuple[Name, ...] = get_args(Name)
     scales: tuple[Scale, ...] = ("final", "step")
     seeds: tuple[int, ...] = (0, 1, 2)
     stride: int = 1  # frames of a step of the one-step models (1: the paper's)

@@ -296,8 +296,8 @@ def _verdict(results: Results, family: str, claim: str, weights: Weights | None)
     chosen = [one for one in differences if one.deciding]
     if len(chosen) < len(deciding):
         return Verdict(family, claim, UNDECIDED, UNDECIDED, tuple(differences))
-    last, best = verdict([one.last for one in chosen]), verdict([one.best for one in chosen])
-    return Verdict(family, claim, last, best, tuple(differences))
+    verdicts = verdict([one.last for one in chosen]), verdict([one.best for one in chosen])
+    return Verdict(family, claim, *verdicts, tuple(differences))
 
 
 def _difference(results: Results, comparison: Comparison, which: str, weights: Weights | None) -> Estimate | None:
