@@ -1,5 +1,7 @@
 """Probes find a linear map that exists, and nothing in shuffled quantities."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -147,6 +149,19 @@ def test_latents_are_the_predictors(predictor):
         given = {name: jnp.float32(x / 255 if name != "pose" else x) for name, x in given.items()}
         want = np.asarray(predictor(**given).mean)
         np.testing.assert_allclose(probes.latents(predictor, inputs, made), want, atol=1e-4)
+
+
+def test_latents_of_a_one_step_model_depend_on_the_condition_and_the_time():
+    config = dataclasses.replace(CONFIG, condition=3, encode_condition=True, prior="conditional")
+    predictor = untrained(config, condition_scale=(10.0, 0.1, 1.0), stride=2, period=0.04)
+    made, rng = frames(5, 0)[0], np.random.default_rng(1)
+    made = made._replace(condition=rng.normal(size=(5, 2)).astype(np.float32), frame=np.tile([6, 8], (5, 1)))
+    given = {"visual": jnp.float32(made.visual[:, 0] / 255), "pose": jnp.asarray(made.pose[:, 0])}
+    want = predictor.rollout(given, 1, condition=made.condition, time=6 * 0.02).mean[:, 0]
+    found = probes.latents(predictor, ("visual", "pose"), made)
+    np.testing.assert_allclose(found, want, atol=1e-4)
+    earlier = probes.latents(predictor, ("visual", "pose"), made._replace(frame=np.tile([0, 2], (5, 1))))
+    assert np.abs(found - earlier).max() > 1e-2
 
 
 def test_raw_inputs_are_reduced_to_sixteen_pixels(predictor):

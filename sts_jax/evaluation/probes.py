@@ -131,9 +131,7 @@ def _means(
     codes = {name: view.encode(name, values) for name, values in given.items()}
     if condition is not None:
         condition = view.encode_condition(condition)
-    return mvae.infer(
-        graphdef, state, codes, present=present, **({} if condition is None else {"condition": condition})
-    ).mean
+    return mvae.infer(graphdef, state, codes, present=present, condition=condition).mean
 
 
 def raw(predictor: Any, inputs: Sequence[str], pairs: Pairs) -> np.ndarray:
