@@ -24,7 +24,7 @@ import tyro
 
 from sts_jax import mvae, training
 
-DATA = Path("/usr/share/dataset/fashion-mnist")  # folder of Debian's package
+DATA = Path("/usr/share/datasets/fashion-mnist")  # folder of Debian's package
 PUBLISHED = {"log p(x)": -232.5, "log p(x, y)": -233.0}
 CLASSES = 10
 BATCH = 50  # test images whose evidence is computed at once
