@@ -128,7 +128,7 @@ def test_the_loss_is_the_sum_of_the_exact_conditional_evidence_of_all_subsets(as
 def test_evidence_of_image_category_and_vector_equals_an_integral_on_a_grid():
     modalities = (
         mvae.Modality("image", "image", (32, 32, 1)),
-        mvae.Modality("label", "category", (4,)),
+        mvae.Modality("label", "category", (4,), 5.0),
         mvae.Modality("place", "vector", (3,), 1.5),
     )
     config = mvae.Config(modalities, latent=2, hidden=8, widths=(2, 2, 2, 2), condition=1, prior="conditional")
