@@ -1,7 +1,7 @@
 """Log evidence of the MVAE on Fashion-MNIST images and labels, beside the published one.
 
     apt-get install dataset-fashion-mnist
-    python -m benchmarks.fashion                # hours on two CPU cores, can be stopped and started again
+    python -m benchmarks.fashion                # 80 minutes on two CPU cores, can be stopped and started again
     python -m benchmarks.fashion --epochs 1     # minutes
 
 The loss is the sum of the bounds of all three subsets of image and label, each of which predicts its own members. The
