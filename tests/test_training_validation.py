@@ -1,5 +1,6 @@
 """The validation loss, and the weights with the least one: which, complete, and the same after a kill."""
 
+import dataclasses
 import json
 import shutil
 
@@ -62,6 +63,12 @@ def test_the_best_weights_are_a_complete_model_folder(finished, tmp_path):
     (moved / "config.json").write_bytes(content.replace(b"latent", b"latenT"))
     with pytest.raises(storage.DamagedFileError, match=r"moved/config\.json is not the file"):
         training.load(moved)
+
+
+def test_best_weights_of_another_training_are_not_mixed_with_new_ones(finished, tmp_path):
+    shutil.copytree(finished[0] / "best", tmp_path / "best")
+    with pytest.raises(ValueError, match=r"best/config\.json is that of another training than .*: delete .*best$"):
+        training.train(dataclasses.replace(CONFIG, seed=1), SMALL, arrays(), workdir=tmp_path, validation=arrays(5))
 
 
 def test_a_blank_written_after_the_training_is_in_both_folders(tmp_path):

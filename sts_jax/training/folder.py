@@ -197,11 +197,14 @@ def save(folder: Path, state: TrainState, *, compact: bool = False) -> None:
 def save_best(folder: Path, state: TrainState) -> None:
     """Write the weights to the model folder `best` in the folder of a model, with its settings, blank and split."""
     best, listed = folder / BEST, manifest(folder)
+    for name in (CONFIG, BLANK):
+        content = (folder / name).read_bytes() if (folder / name).exists() else None
+        if content is not None and not (best / name).exists():
+            storage.write_bytes(best / name, content)
+        elif content is not None and (best / name).read_bytes() != content:
+            raise ValueError(f"{best / name} is that of another training than {folder / name}: delete {best}")
     if verified(best) == int(state.step):
         return  # written before a kill
-    for name in (CONFIG, BLANK):
-        if (folder / name).exists() and not (best / name).exists():
-            storage.write_bytes(best / name, (folder / name).read_bytes())
     if manifest(best) is None:
         facts = {} if listed is None else {name: fact for name, fact in listed.facts.items() if name == "split"}
         storage.write_manifest(best, {}, {**facts, "step": None})
