@@ -2,6 +2,10 @@
 
 import dataclasses
 import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -284,6 +288,33 @@ def test_no_held_out_object_is_in_a_training_or_validation_batch(workdir):
             found = {known[image] for image in images if image != scene.empty["visual"].tobytes()}
             assert found
             assert not found & held_out
+
+
+@pytest.mark.slow
+def test_the_command_runs_where_the_first_frame_has_no_touch(tmp_path):
+    root = Path(__file__).parents[1]
+    words = ["--preset", "smoke", "--scenarios", "freefall", "--models", "mvae", "vae-tactile", "statespace"]
+    words += ["--freefall.resolution", "32", "32", "--workdir", str(tmp_path / "run")]
+    done = subprocess.run(
+        [sys.executable, "-m", "experiments.table1", *words],
+        cwd=root,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")])},
+        capture_output=True,
+        text=True,
+        timeout=3600,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.startswith("6 models, about ")
+    assert "[6/6] freefall/statespace-step-seed0" in done.stderr
+    assert "The state-space model, claim (b): **" in done.stdout
+    drawn = {path.stem for path in (tmp_path / "run" / "figures" / "freefall").glob("*.png")}
+    sheets = {f"{kind}-{model}" for kind in ("predictions", "rollout") for model in ("mvae", "statespace")}
+    assert sheets | {"models", "errors"} <= drawn
+    assert "# freefall: MVAE with pose, final-step" in (tmp_path / "run" / "probes.md").read_text()
+    recomputed = recomputing.main(recomputing.Args(tmp_path / "run"))
+    assert {line.split(" | ")[0] for line in recomputed.splitlines()[2:]} == {
+        f"| freefall/{name}-seed0" for name in ("mvae-final", "mvae-step", "statespace-final")
+    }
 
 
 def discs(rng, count, side=32):
