@@ -1,6 +1,6 @@
 """The paper's Table 1: four models of three scenarios at two time scales, and ours, with a verdict on its two claims.
 
-    python -m experiments.table1                  # about two hours on two CPU cores, 13 GB on disk, can be resumed
+    python -m experiments.table1                  # about 2.7 hours on two CPU cores, 13 GB on disk, can be resumed
     python -m experiments.table1 --seeds 0        # one seed, in a third of the time. More seeds may follow
     python -m experiments.table1 --preset smoke   # about three minutes, for tests
     python -m experiments.table1 --preset paper   # the paper's data size and training schedule: weeks, days on a GPU
@@ -39,8 +39,8 @@ DEFAULT = Config(
     inclined=dataclasses.replace(COLLECTION, scenario=physics.Inclined()),
     perturbed=dataclasses.replace(COLLECTION, scenario=physics.Perturbed(), categories=("bottle",)),
     # All cells make the same number of steps with batches of the same size.
-    training=dataclasses.replace(common.TRAINING, steps=200, checkpoint_every=40),
-    state_training=dataclasses.replace(common.STATE_TRAINING, steps=160, warmup=30, checkpoint_every=40),
+    training=dataclasses.replace(common.TRAINING, steps=300, checkpoint_every=50),
+    state_training=dataclasses.replace(common.STATE_TRAINING, steps=300, warmup=50, checkpoint_every=50),
 )
 
 
