@@ -2,7 +2,7 @@
 
     python -m experiments.table1                  # about 2.7 hours on two CPU cores, 13 GB on disk, can be resumed
     python -m experiments.table1 --seeds 0        # one seed, in a third of the time. More seeds may follow
-    python -m experiments.table1 --preset smoke   # about three minutes, for tests
+    python -m experiments.table1 --preset smoke   # two steps of every model, for tests (nearly all is compilation)
     python -m experiments.table1 --preset paper   # the paper's data size and training schedule: weeks, days on a GPU
 
 The results go to `runs/table1/`: `table1.md`, `claims.md`, `metrics.json` and figures. See `docs/experiments.md` for
