@@ -119,7 +119,8 @@ def test_density_of_a_step_is_that_of_a_mixture_about_constant_velocity(model):
         ]
         np.testing.assert_allclose(found[i], special.logsumexp(parts), rtol=1e-3)
         ahead = back @ np.asarray(velocity[i])
-        assert np.abs(density.mean[i, 0] - ahead).max() < 0.2  # an untrained transition changes the velocity little
+        assert np.abs(density.mean[i, 0, :-1] - ahead).max() < 0.2  # it changes the velocity little
+        np.testing.assert_array_equal(density.mean[i, 0, -1], 0)  # an object at rest
 
 
 def test_a_step_turns_with_the_scene(model):
@@ -205,12 +206,11 @@ def test_steps_are_drawn_from_all_frames_with_the_velocity_of_the_course(batch):
     velocity = poses.motion(course[index, before], course[index, frame])
     motion = poses.motion(course[index, frame], course[index, frame + stride])
     np.testing.assert_allclose(steps.velocity[exact], velocity[exact], atol=1e-5)
-    np.testing.assert_allclose(steps.motion[exact], motion[exact], atol=1e-5)
-    np.testing.assert_allclose(steps.belief.mean[exact, :12], course[index, frame][exact], atol=1e-4)
+    np.testing.assert_allclose(steps.motion, motion, atol=1e-5)
+    np.testing.assert_allclose(steps.belief.mean[:, :12], course[index, frame], atol=1e-4)
     same(steps.velocity[frame == 0], jnp.zeros_like(velocity[frame == 0]))
-    shift = poses.motion(steps.belief.mean[:, :12], course[index, frame])
-    for error, scale in ((steps.velocity - velocity, objective._JITTER), (shift, objective._JITTER_OF_POSE)):
-        np.testing.assert_allclose(np.asarray(error)[~exact].std(0), scale, rtol=0.3, atol=1e-4)
+    scatter = np.asarray(steps.velocity - velocity)[~exact].std(0)
+    np.testing.assert_allclose(scatter, objective._JITTER, rtol=0.3)
 
 
 @pytest.mark.slow
@@ -271,7 +271,7 @@ def coasting(rng, number, frames=11):
 
 def test_the_transition_learns_a_fall_and_a_push_of_known_duration():
     """Falls of 100 mm and pushes of up to 160 mm: the poses of all 10 steps of a roll-out are within a few mm."""
-    config = dataclasses.replace(CONFIG, transition=64, inputs=("visual",), components=1)
+    config = dataclasses.replace(CONFIG, transition=64, inputs=("visual",), components=2)
     graphdef, params, _ = statespace.init(jax.random.key(0), config)
     data, test = coasting(np.random.default_rng(0), 4096), coasting(np.random.default_rng(1), 32)
     optimiser = optax.adam(optax.cosine_decay_schedule(5e-3, 400))

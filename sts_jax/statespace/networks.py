@@ -31,8 +31,9 @@ EXACT_LOG_VAR = -9.2  # log variance of a pose that is an input: 0.5 mm for a po
 CONTRAST = 40.0  # contrast of samples without a calibration, see `compose`
 _LOG_VAR_LIMIT = 8.0  # largest absolute value of an encoder's log variances
 _FINAL_LOG_VAR = (-3.0, 5.0)  # range of the log variances of the final pose: its centre and half of its width
-_STEP_LOG_VAR = (-7.0, 6.0)  # the same for the motion over one step: standard deviations from 0.08 mm to 30 mm
-_STEP = 0.1  # unit of the correction of a constant velocity, in numbers of a motion
+_STEP_LOG_VAR = (-5.0, 4.2)  # the same for the motion over one step: standard deviations from 0.5 mm to 30 mm
+_REST_LOG_VAR = -13.8  # log variance of the motion of a resting object: 0.05 mm
+_STEP = 0.3  # unit of the correction of a constant velocity, in numbers of a motion
 _SLOW = 20.0  # factor of the velocity in a further, saturated input, which separates slow from resting objects
 _OUTSIDE = 8.0  # difference of the logit of being covered by the object, between inside and outside of the canvas
 # The tint describes the mean colour of the object in the visual image. For each colour channel, it is the mean change
@@ -234,7 +235,9 @@ class Encoder(nnx.Module):
 class Transition(nnx.Module):
     """Predicts the density of the final pose from the state in the first frame, or that of a step from any state.
 
-    The mean of a step is the velocity plus a learnt correction, as if inertia alone moved the object.
+    The mean of a step is the velocity plus a learnt correction, as if inertia alone moved the object. The last
+    component of its mixture stands for objects at rest, and only its weight is learnt. Most steps are those of resting
+    objects, and components that learnt their tiny variance would dominate the gradient.
 
     The appearance code is not an input. Otherwise, the transition would recognise training objects by their appearance
     (see docs/trials.md).
@@ -293,11 +296,15 @@ class Transition(nnx.Module):
             x = layer(x)
         x = jax.nn.swish(self.norm(x))
         mixture = self.mixture(x).reshape(len(x), config.outcomes, config.components, -1)
+        mean = likely[:, None, None] + unit * mixture[..., 1 : 1 + self.size]
+        log_var = middle + reach * jnp.tanh(mixture[..., 1 + self.size :] / reach)
+        if velocity is not None:
+            mean, log_var = mean.at[..., -1, :].set(0), log_var.at[..., -1, :].set(_REST_LOG_VAR)
         return FinalPose(
             outcome=jax.nn.log_softmax(self.outcome(x)),
             weight=jax.nn.log_softmax(mixture[..., 0]),
-            mean=likely[:, None, None] + unit * mixture[..., 1 : 1 + self.size],
-            log_var=middle + reach * jnp.tanh(mixture[..., 1 + self.size :] / reach),
+            mean=mean,
+            log_var=log_var,
             heading=heading,
         )
 

@@ -52,10 +52,9 @@ from sts_jax.statespace.networks import (
 )
 
 _LEAST = 1 / 1020  # rendered images are clipped to this distance from 0 and 1
-# Standard deviations of the noise in the velocities and poses from which a one-step model learns, as motions: 0.2 mm
-# for a position scale of 50 mm, and 0.3 degrees. Poses have noise in height and lean only, which contacts determine
-_JITTER = np.array([0.004, 0.004, 0.004, 0.005, 0.005, 0.005], np.float32)
-_JITTER_OF_POSE = _JITTER * np.array([0, 0, 1, 1, 1, 0], np.float32)
+# Standard deviation of the noise in the velocities from which a one-step model learns: 0.2 mm for a position scale of
+# 50 mm, and 0.3 degrees
+_JITTER = np.repeat(np.array([0.004, 0.005], np.float32), 3)
 
 
 def log_density(
@@ -353,11 +352,11 @@ def _drawn_steps(key: PRNGKeyArray, config: Config, ends: _Ends) -> _Steps:
     """Draw a step of each trajectory: from frame 0, or from a frame with another one a step before it.
 
     Early frames are drawn more often (frame t with a density that falls as `t**-0.5`), because most objects soon rest.
-    The belief about the first frame is moved to this frame. In every second step, noise is added to the true pose and
-    the velocity, so that the transition learns to correct the errors of earlier steps of a roll-out.
+    The belief about the first frame is moved to this frame. In every second step, noise is added to the velocity, so
+    that the transition learns to correct the errors of earlier steps of a roll-out, and to bring slow objects to rest.
     """
     number, frames = ends.pose.shape[:2]
-    which, shift, drift = jax.random.split(key, 3)
+    which, jitter = jax.random.split(key)
     count = max(frames - 2 * config.stride, 0) + 1
     place = jnp.minimum((count * jax.random.uniform(which, (number,)) ** 2).astype(int), count - 1)
     frame = jnp.where(place == 0, 0, place + config.stride - 1)
@@ -368,11 +367,10 @@ def _drawn_steps(key: PRNGKeyArray, config: Config, ends: _Ends) -> _Steps:
     now, after = at(ends.pose, frame), at(ends.pose, frame + config.stride)
     velocity = poses.motion(at(ends.pose, jnp.maximum(frame - config.stride, 0)), now)
     noisy = (jnp.arange(number) // 2 % 2 * (frame > 0))[:, None]
-    now = poses.advanced(now, noisy * _JITTER_OF_POSE * jax.random.normal(shift, velocity.shape))
     rotation = rotation_between(ends.state, now)
     return _Steps(
         belief=moved(ends.belief, now[:, :3], rotation),
-        velocity=velocity + noisy * _JITTER * jax.random.normal(drift, velocity.shape),
+        velocity=velocity + noisy * _JITTER * jax.random.normal(jitter, velocity.shape),
         motion=poses.motion(now, after),
         condition=None if ends.condition is None else at(ends.condition, frame),
         gone=state.gone(state.split(ends.state), config.position_scale * now[:, 2], rotation),
