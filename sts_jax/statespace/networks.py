@@ -34,6 +34,7 @@ _FINAL_LOG_VAR = (-3.0, 5.0)  # range of the log variances of the final pose: it
 _STEP_LOG_VAR = (-5.0, 4.2)  # the same for the motion over one step: standard deviations from 0.5 mm to 30 mm
 _REST_LOG_VAR = -13.8  # log variance of the motion of a resting object: 0.05 mm
 _STEP = 0.3  # unit of the correction of a constant velocity, in numbers of a motion
+_BELOW = -0.005  # m, an object whose lowest point is deeper does not land on the pad
 _SLOW = 20.0  # factor of the velocity in a further, saturated input, which separates slow from resting objects
 _OUTSIDE = 8.0  # difference of the logit of being covered by the object, between inside and outside of the canvas
 # The tint describes the mean colour of the object in the visual image. For each colour channel, it is the mean change
@@ -235,9 +236,9 @@ class Encoder(nnx.Module):
 class Transition(nnx.Module):
     """Predicts the density of the final pose from the state in the first frame, or that of a step from any state.
 
-    The mean of a step is the velocity plus a learnt correction, as if inertia alone moved the object. The last
-    component of its mixture stands for objects at rest, and only its weight is learnt. Most steps are those of resting
-    objects, and components that learnt their tiny variance would dominate the gradient.
+    The mean of a step is the velocity plus a learnt correction, as if inertia alone moved the object until its lowest
+    point lands on the pad. The last component of the mixture stands for objects at rest, and only its weight is learnt.
+    Most steps are those of resting objects, and components that learnt their tiny variance would dominate the gradient.
 
     The appearance code is not an input. Otherwise, the transition would recognise training objects by their appearance
     (see docs/trials.md).
@@ -291,6 +292,8 @@ class Transition(nnx.Module):
             likely, unit, (middle, reach) = poses.turn_motion_back(heading, velocity), _STEP, _STEP_LOG_VAR
             gap = config.position_scale * known.pose[:, 2] - state.reach(known, still)
             features += [likely, jnp.tanh(_SLOW * likely), gap[:, None] / state.LENGTH]
+            down = jnp.where(gap > _BELOW, -gap / config.position_scale, -jnp.inf)
+            likely = likely.at[:, 2].set(jnp.maximum(likely[:, 2], down))
         x = self.first(_joined(*features))
         for layer in self.layers:
             x = layer(x)
