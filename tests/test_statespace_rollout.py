@@ -103,7 +103,7 @@ def transition(model, code, condition, velocity):
 
 def test_density_of_a_step_is_that_of_a_mixture_about_constant_velocity(model):
     rng = np.random.default_rng(0)
-    code, condition = random_states(rng, 2), jnp.asarray(rng.normal(size=(2, 3)), jnp.float32)
+    code, condition = random_states(rng, 2).at[:, 2].set(3.0), jnp.asarray(rng.normal(size=(2, 3)), jnp.float32)
     velocity, motion = (jnp.asarray(0.3 * rng.normal(size=(2, 6)), jnp.float32) for _ in range(2))
     density = jax.jit(functools.partial(transition, model))(code, condition, velocity)
     numbers = poses.turn_motion_back(density.heading, motion)
@@ -121,6 +121,21 @@ def test_density_of_a_step_is_that_of_a_mixture_about_constant_velocity(model):
         ahead = back @ np.asarray(velocity[i])
         assert np.abs(density.mean[i, 0, :-1] - ahead).max() < 0.2  # it changes the velocity little
         np.testing.assert_array_equal(density.mean[i, 0, -1], 0)  # an object at rest
+
+
+def test_without_a_correction_an_object_lands_on_the_pad(model):
+    """A sphere 2 mm above the pad, one 100 mm above it and one below it, all with 50 mm per step downwards."""
+    radius, height = 0.01, np.array([0.012, 0.11, -0.03])
+    place = np.concatenate([np.zeros((3, 2)), height[:, None] / 0.05, np.tile(np.eye(3).ravel(), (3, 1))], axis=1)
+    solid = np.full((3, 128), radius), np.full(3, 0.05), np.zeros((3, 3))
+    code = statespace.encode(*(jnp.asarray(x, jnp.float32) for x in (place, *solid)))
+    params = jax.tree.map(lambda x: x, model[1])
+    for name in ("kernel", "bias"):
+        params["transition"]["mixture"][name][...] = 0 * params["transition"]["mixture"][name][...]
+    velocity = jnp.zeros((3, 6)).at[:, 2].set(-1.0)
+    density = jax.jit(functools.partial(transition, (model[0], params)))(code, jnp.zeros((3, 3)), velocity)
+    for mean, down in zip(density.mean[:, 0, 0], [-0.04, -1.0, -1.0], strict=True):
+        np.testing.assert_allclose(mean, [0, 0, down, 0, 0, 0], atol=1e-3)
 
 
 def test_a_step_turns_with_the_scene(model):
