@@ -371,7 +371,7 @@ def test_a_predictor_rolls_out_with_the_time_of_each_step(predictor):
     out = predictor.rollout(given, 3, condition=GIVEN_CONDITION, time=0.2)
     each = np.repeat(GIVEN_CONDITION[:, None], 3, axis=1) / 10
     condition = np.concatenate([each, np.broadcast_to(0.2 + 0.1 * np.arange(3)[:, None], (2, 3, 1))], axis=2)
-    inputs = {"visual": jnp.asarray(given["visual"]), "pose": view.encode_pose(given["pose"])}
+    inputs = {"visual": jnp.asarray(given["visual"]), "pose": view.encode_pose(jnp.asarray(given["pose"]))}
     parts = predictor.model.graphdef, predictor.model.state, None, inputs, dict.fromkeys(inputs, jnp.ones(2, bool))
     empty = {name: jnp.asarray(image) for name, image in predictor.empty.items()}
     rolled = statespace.rollout(*parts, empty, jnp.asarray(condition, jnp.float32), steps=3)
