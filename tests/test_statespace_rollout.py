@@ -123,18 +123,18 @@ def test_density_of_a_step_is_that_of_a_mixture_about_constant_velocity(model):
         np.testing.assert_array_equal(density.mean[i, 0, -1], 0)  # an object at rest
 
 
-def test_without_a_correction_an_object_lands_on_the_pad(model):
-    """A sphere 2 mm above the pad, one 100 mm above it and one below it, all with 50 mm per step downwards."""
-    radius, height = 0.01, np.array([0.012, 0.11, -0.03])
-    place = np.concatenate([np.zeros((3, 2)), height[:, None] / 0.05, np.tile(np.eye(3).ravel(), (3, 1))], axis=1)
-    solid = np.full((3, 128), radius), np.full(3, 0.05), np.zeros((3, 3))
+def test_an_object_does_not_sink_into_the_pad(model):
+    """Spheres 2 mm above the pad, 100 mm above, below it and beside it, all with 50 mm per step downwards."""
+    radius, position = 0.01, np.array([[0, 0, 0.012], [0, 0, 0.11], [0, 0, -0.03], [0.1, 0, 0.012]])
+    place = np.concatenate([position / 0.05, np.tile(np.eye(3).ravel(), (4, 1))], axis=1)
+    solid = np.full((4, 128), radius), np.full(4, 0.05), np.zeros((4, 3))
     code = statespace.encode(*(jnp.asarray(x, jnp.float32) for x in (place, *solid)))
     params = jax.tree.map(lambda x: x, model[1])
     for name in ("kernel", "bias"):
         params["transition"]["mixture"][name][...] = 0 * params["transition"]["mixture"][name][...]
-    velocity = jnp.zeros((3, 6)).at[:, 2].set(-1.0)
-    density = jax.jit(functools.partial(transition, (model[0], params)))(code, jnp.zeros((3, 3)), velocity)
-    for mean, down in zip(density.mean[:, 0, 0], [-0.04, -1.0, -1.0], strict=True):
+    velocity = jnp.zeros((4, 6)).at[:, 2].set(-1.0)
+    density = jax.jit(functools.partial(transition, (model[0], params)))(code, jnp.zeros((4, 3)), velocity)
+    for mean, down in zip(density.mean[:, 0, 0], [-0.08, -1.0, -1.0, -1.0], strict=True):  # 2 mm into the pad at most
         np.testing.assert_allclose(mean, [0, 0, down, 0, 0, 0], atol=1e-3)
 
 

@@ -34,7 +34,8 @@ _FINAL_LOG_VAR = (-3.0, 5.0)  # range of the log variances of the final pose: it
 _STEP_LOG_VAR = (-5.0, 4.2)  # the same for the motion over one step: standard deviations from 0.5 mm to 30 mm
 _REST_LOG_VAR = -13.8  # log variance of the motion of a resting object: 0.05 mm
 _STEP = 0.3  # unit of the correction of a constant velocity, in numbers of a motion
-_BELOW = -0.005  # m, an object whose lowest point is deeper does not land on the pad
+_BELOW = -0.02  # m, an object whose lowest point is deeper does not land on the pad
+_SLACK = 0.002  # m, largest mean depth of the lowest point after a step, more than the error of a support function
 _SLOW = 20.0  # factor of the velocity in a further, saturated input, which separates slow from resting objects
 _OUTSIDE = 8.0  # difference of the logit of being covered by the object, between inside and outside of the canvas
 # The tint describes the mean colour of the object in the visual image. For each colour channel, it is the mean change
@@ -236,9 +237,10 @@ class Encoder(nnx.Module):
 class Transition(nnx.Module):
     """Predicts the density of the final pose from the state in the first frame, or that of a step from any state.
 
-    The mean of a step is the velocity plus a learnt correction, as if inertia alone moved the object until its lowest
-    point lands on the pad. The last component of the mixture stands for objects at rest, and only its weight is learnt.
-    Most steps are those of resting objects, and components that learnt their tiny variance would dominate the gradient.
+    The mean of a step is the velocity plus a learnt correction, as if inertia alone moved the object. While its centre
+    of mass is above the pad, its lowest point does not sink. The last component of the mixture stands for objects at
+    rest, and only its weight is learnt. Most steps are those of resting objects, and components that learnt their tiny
+    variance would dominate the gradient.
 
     The appearance code is not an input. Otherwise, the transition would recognise training objects by their appearance
     (see docs/trials.md).
@@ -292,8 +294,6 @@ class Transition(nnx.Module):
             likely, unit, (middle, reach) = poses.turn_motion_back(heading, velocity), _STEP, _STEP_LOG_VAR
             gap = config.position_scale * known.pose[:, 2] - state.reach(known, still)
             features += [likely, jnp.tanh(_SLOW * likely), gap[:, None] / state.LENGTH]
-            down = jnp.where(gap > _BELOW, -gap / config.position_scale, -jnp.inf)
-            likely = likely.at[:, 2].set(jnp.maximum(likely[:, 2], down))
         x = self.first(_joined(*features))
         for layer in self.layers:
             x = layer(x)
@@ -302,6 +302,10 @@ class Transition(nnx.Module):
         mean = likely[:, None, None] + unit * mixture[..., 1 : 1 + self.size]
         log_var = middle + reach * jnp.tanh(mixture[..., 1 + self.size :] / reach)
         if velocity is not None:
+            place = config.position_scale * known.pose[:, :2] + state.LENGTH * known.com_in_sensor[:, :2]
+            lands = jnp.all(jnp.abs(place) < config.view / 2, axis=-1) & (gap > _BELOW)
+            lowest = jnp.where(lands, -(gap + _SLACK) / config.position_scale, -jnp.inf)
+            mean = mean.at[..., 2].set(jnp.maximum(mean[..., 2], lowest[:, None, None]))
             mean, log_var = mean.at[..., -1, :].set(0), log_var.at[..., -1, :].set(_REST_LOG_VAR)
         return FinalPose(
             outcome=jax.nn.log_softmax(self.outcome(x)),
