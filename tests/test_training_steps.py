@@ -1,6 +1,7 @@
 """Pairs of any frames and one-step training arrays, in memory and from disk, against frames that are known."""
 
 import dataclasses
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -269,4 +270,6 @@ def test_the_code_of_the_page_trains_a_one_step_model(tmp_path, monkeypatch):
     assert old in code
     exec(code.replace(old, "steps=2, checkpoint_every=1, log_every=1"), names)
     assert names["last"].preprocessing.stride == 1
-    assert names["best"].model.step == min((1, 2), key=lambda step: training.records("steps")[step - 1]["validation"])
+    assert names["best"].model.step == min(
+        (1, 2), key=lambda step: training.records(Path("steps"))[step - 1]["validation"]
+    )
