@@ -162,17 +162,18 @@ def read_arrays(path: Path, remedy: str) -> dict[str, np.ndarray]:
         raise DamagedFileError(f"{path} is damaged ({error}): {remedy}.") from error
 
 
-def claim(path: Path, content: dict) -> None:
+def claim(path: Path, content: dict, defaults: dict | None = None) -> None:
     """Record settings in a JSON file, or check that an existing file has the same settings.
 
-    The check ensures that all results in a folder have the same settings. Tuples count as lists.
+    The check ensures that all results in a folder have the same settings. Tuples count as lists. A field that the file
+    lacks, because an older version wrote it, counts as equal to its default in `defaults`, from `default_fields`.
     """
     content = json.loads(json.dumps(content))
     if not path.exists():
         write_json(path, content)
         return
     recorded = read_json(path, f"delete {path.parent}, or choose another folder")
-    changes = list(_differences(recorded, content))
+    changes = list(_differences(_filled(recorded, content, json.loads(json.dumps(defaults or {}))), content))
     if changes:
         old = ", ".join(f"{field or 'content'} = {value!r}" for field, value, _ in changes[:_SHOWN])
         new = ", ".join(f"{field or 'content'} = {value!r}" for field, _, value in changes[:_SHOWN])
@@ -181,6 +182,25 @@ def claim(path: Path, content: dict) -> None:
             f"{path} was made with {old}, but the current settings have {new}{more}: "
             f"choose another folder, or delete {path.parent} to start again."
         )
+
+
+def default_fields(value: Any) -> dict:
+    """The default values of the fields of a dataclass instance, with those of the dataclasses in its fields."""
+    fields = {field.name: field.default for field in dataclasses.fields(value)}
+    inner = {name: getattr(value, name) for name in fields if dataclasses.is_dataclass(getattr(value, name))}
+    plain = {name: default for name, default in fields.items() if name not in inner}
+    return {name: default for name, default in plain.items() if default is not dataclasses.MISSING} | {
+        name: default_fields(part) for name, part in inner.items()
+    }
+
+
+def _filled(recorded: Any, content: Any, defaults: dict) -> Any:
+    """A recorded content with the defaults of the fields that it lacks, of those that the new content has."""
+    if not isinstance(recorded, dict) or not isinstance(content, dict):
+        return recorded
+    lacking = {name: value for name, value in defaults.items() if name in content and not isinstance(value, dict)}
+    parts = {name: part for name, part in defaults.items() if name in recorded and isinstance(part, dict)}
+    return lacking | recorded | {name: _filled(recorded[name], content.get(name), part) for name, part in parts.items()}
 
 
 _SHOWN = 3  # number of differing fields whose values a message contains

@@ -1,5 +1,6 @@
 """Atomic writes, JSON files that cannot change unnoticed, checksums, and the lock on a folder."""
 
+import contextlib
 import dataclasses
 import errno
 import json
@@ -247,3 +248,29 @@ def test_a_finished_folder_is_read_on_a_read_only_disk(tmp_path, monkeypatch):
         assert list(tmp_path.iterdir()) == []
     with pytest.raises(OSError, match=r"cannot create or write to .*Choose a folder"), storage.lock(tmp_path):
         pytest.fail("locked")
+
+
+@dataclasses.dataclass(frozen=True)
+class _Inner:
+    old: int = 1
+    new: tuple[int, ...] = (2, 3)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Outer:
+    inner: _Inner
+    needed: int
+    later: str = "usual"
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [({}, None), ({"later": "other"}, "later = 'usual'"), ({"inner": _Inner(1, (4,))}, r"inner\.new = \[2, 3\]")],
+)
+def test_a_field_that_an_older_version_lacked_counts_as_its_default(tmp_path, changed, message):
+    path = tmp_path / "config.json"
+    storage.write_json(path, {"inner": {"old": 1}, "needed": 5})
+    now = dataclasses.replace(_Outer(_Inner(), 5), **changed)
+    with pytest.raises(ValueError, match=message) if message else contextlib.nullcontext():
+        storage.claim(path, dataclasses.asdict(now), storage.default_fields(now))
+    assert storage.read_json(path, "") == {"inner": {"old": 1}, "needed": 5}

@@ -176,7 +176,7 @@ def main(config: Config, workdir: Path, *, only: Stage | None = None, own: Exten
     check(config, own)
     sensor = sts.Sensor()
     with storage.lock(workdir, finished=True):
-        storage.claim(workdir / "config.json", dataclasses.asdict(config))
+        storage.claim(workdir / "config.json", dataclasses.asdict(config), storage.default_fields(config))
         folder = workdir / "dataset"
         data = collect(config.collection, sensor, folder) if only in (None, "collect") else dataset.load(folder)
         if only == "collect":

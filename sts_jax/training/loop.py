@@ -5,7 +5,6 @@ The loop is a Python loop over one compiled step, because convolutions in `lax.s
 
 import collections
 import concurrent.futures
-import dataclasses
 import functools
 import json
 import os
@@ -277,12 +276,14 @@ def train(
     if notes:
         settings["notes"] = notes
     settings = json.loads(json.dumps(settings))
+    groups = {"model": model, "training": config, "preprocessing": Preprocessing()}
+    defaults = {name: storage.default_fields(group) for name, group in groups.items()}
     if folder.verified(workdir) == total:  # without a lock, because a lock would write a file
-        _claim(workdir / folder.CONFIG, settings, model)
+        storage.claim(workdir / folder.CONFIG, settings, defaults)
         _send(folder.records(workdir), log)
         return load(workdir, calibrated=False)
     with storage.lock(workdir):
-        _claim(workdir / folder.CONFIG, settings, model)
+        storage.claim(workdir / folder.CONFIG, settings, defaults)
         optimiser = optimiser or _default_optimiser(config, total)
         graphdef, state = initial(config, task, total, optimiser)
         state = folder.restore(workdir, state) or state
@@ -383,18 +384,6 @@ def _scorer(
         return float(np.average(values, weights=[len(index) for index in rows]))
 
     return score
-
-
-def _claim(path: Path, settings: dict[str, Any], model: Config) -> None:
-    """Record or compare the settings of a training. Fields that an older version lacked must have their defaults."""
-    recorded = storage.read_json(path, f"delete {path.parent}, or choose another folder") if path.exists() else None
-    settings = dict(settings)
-    for group, kind in (("model", type(model)), ("training", TrainConfig), ("preprocessing", Preprocessing)):
-        if isinstance(recorded, dict) and isinstance(known := recorded.get(group), dict):
-            new = {field.name: field.default for field in dataclasses.fields(kind) if field.name not in known}
-            values = settings[group].items()
-            settings[group] = {name: value for name, value in values if name not in new or value != new[name]}
-    storage.claim(path, settings)
 
 
 def _check_validation(model: Config, validation: Arrays) -> None:
