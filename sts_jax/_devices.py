@@ -33,6 +33,16 @@ def on_each_device(function: Callable[[Any, Any], Any], items: Any, shared: Any,
     return call(items, shared)
 
 
+def is_inside_mesh(items: Any) -> bool:
+    """Whether arrays of a tree lie on a mesh with explicit axes of which none splits their first axis.
+
+    They are then perhaps items of a larger batch that `jax.vmap` maps over such an axis.
+    """
+    leaves = jax.tree.leaves(items)
+    explicit = any(AxisType.Explicit in jax.typeof(x).sharding.mesh.axis_types for x in leaves)
+    return explicit and all(_names(x) is None for x in leaves)
+
+
 def _names(x: Any) -> Any:
     """Explicit axes of the mesh over which the first axis of an array is split, or None."""
     sharding = jax.typeof(x).sharding

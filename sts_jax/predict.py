@@ -16,9 +16,10 @@ from jaxtyping import Array, ArrayLike, Bool, Key, Num
 
 from sts_jax import mvae, statespace, storage, training
 from sts_jax._checked import checked, in_32_bits, warn
-from sts_jax._devices import on_each_device
+from sts_jax._devices import is_inside_mesh, on_each_device
 from sts_jax._plausible import image_problem, order_problem, pair_problem, pose_problem
 from sts_jax.prediction import Prediction, completed, flagged, predict, predict_samples, rollout, rollout_samples
+from sts_jax.rendering.loop import looped
 
 STREAMS = ("visual", "tactile")
 MODALITIES = (*STREAMS, "pose")
@@ -325,9 +326,10 @@ class Predictor:
         course: _Course | None = None,
     ) -> Prediction:
         condition, fine = self._condition(condition, lead, course)
-        given = inputs, present, condition, key if key is not None and key.ndim else None
+        single = key is not None and not key.ndim
+        given, shared = (inputs, present, condition, None if single else key), key if single else None
 
-        def run(given: tuple, lead: tuple[int, ...]) -> Prediction:
+        def run(given: tuple, key: Any, lead: tuple[int, ...]) -> Prediction:
             inputs, present, condition, keys = given
             model, view = self.model, self.preprocessing
             graphdef, state, shared = model.graphdef, model.state, (condition, key if keys is None else keys)
@@ -343,15 +345,19 @@ class Predictor:
                 return rollout_samples(*own, *more, steps=course.steps, last=course.last)
             return predict_samples(*own, *more, model.calibration)
 
-        def of_device(given: tuple, _: tuple) -> Prediction:
-            return run(given, next(iter(jax.tree.leaves(given))).shape[: len(lead)] if inputs else lead)
+        def of_device(given: tuple, key: Any) -> Prediction:
+            return run(given, key, next(iter(jax.tree.leaves(given))).shape[: len(lead)] if inputs else lead)
+
+        def whole(given: tuple, key: Any) -> Prediction:
+            return on_each_device(of_device, given, key, _axes(num_samples)) if lead else run(given, key, lead)
 
         chunk, count = _CHUNK.get(jax.default_backend(), 256), math.prod(lead)
         if count <= chunk or any(map(_traced, jax.tree.leaves((given, key)))):
-            result = on_each_device(of_device, given, (), _axes(num_samples)) if lead else run(given, lead)
+            # `jax.vmap` over an explicit axis of a mesh
+            result = (looped(whole) if is_inside_mesh(given) else whole)(given, shared)
         else:
             flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(lead) :]), given)
-            result = _joined([run(part, (chunk,)) for part in _cut(flat, chunk, count)], lead)
+            result = _joined([run(part, shared, (chunk,)) for part in _cut(flat, chunk, count)], lead)
         valid = valid if fine is None else [*valid, fine]
         return flagged(result, jnp.all(jnp.stack(valid), axis=0), time=int(course is not None)) if valid else result
 

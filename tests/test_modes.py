@@ -156,6 +156,32 @@ def test_a_loop_over_a_batch_runs_on_a_mesh_with_explicit_axes():
     run(MESH, XLA_FLAGS="--xla_force_host_platform_device_count=2")
 
 
+PREDICTION = """
+import jax, numpy as np
+from jax.sharding import NamedSharding, PartitionSpec
+from statespace_config import state_model
+import sts_jax as sts
+
+made, rng = state_model(), np.random.default_rng(0)
+blank = np.full((*made.preprocessing.resolution, 3), (150, 160, 200), np.uint8)
+predict = sts.Predictor(made.model, made.preprocessing, (blank, blank), "mesh")
+images = np.clip(predict.empty["visual"] + rng.normal(0, 0.1, (4, *blank.shape)), 0, 1).astype(np.float32)
+condition = np.zeros((4, made.model.config.condition), np.float32)
+truth = predict(visual=images, condition=condition)
+sharding = NamedSharding(jax.make_mesh((2,), ("batch",)), PartitionSpec("batch"))
+mapped = jax.vmap(lambda image, condition: predict(visual=image, condition=condition))
+found = mapped(*jax.device_put((images, condition), sharding))
+for leaf, expected in zip(jax.tree.leaves(found), jax.tree.leaves(truth), strict=True):
+    np.testing.assert_allclose(leaf, expected, atol=2e-5)
+    assert leaf.sharding.spec[0] == "batch"
+"""
+
+
+@pytest.mark.slow
+def test_a_predictor_is_mapped_over_a_mesh_with_explicit_axes():
+    run(PREDICTION, XLA_FLAGS="--xla_force_host_platform_device_count=2")
+
+
 CACHE = """
 import jax, jax.numpy as jnp, sts_jax
 print(sts_jax.enable_compilation_cache())
