@@ -172,7 +172,7 @@ sharding = NamedSharding(jax.make_mesh((2,), ("batch",)), PartitionSpec("batch")
 mapped = jax.vmap(lambda image, condition: predict(visual=image, condition=condition))
 found = mapped(*jax.device_put((images, condition), sharding))
 for leaf, expected in zip(jax.tree.leaves(found), jax.tree.leaves(truth), strict=True):
-    np.testing.assert_allclose(leaf, expected, atol=2e-5)
+    np.testing.assert_allclose(leaf, expected, atol=5e-4)
     assert leaf.sharding.spec[0] == "batch"
 """
 
