@@ -178,7 +178,8 @@ def _default(kind: type[Sensor], lights: type[Lights | Leds]) -> Sensor:
 
 
 def _default_of(sensor: Sensor) -> Sensor:
-    return _default(type(sensor), Leds if isinstance(sensor.lights, Leds) else Lights)
+    kind: Any = type(sensor)  # mypy takes a class without hashable instances for unhashable
+    return _default(kind, Leds if isinstance(sensor.lights, Leds) else Lights)
 
 
 def _conditions(sensor: Sensor) -> Iterator[_Condition]:
