@@ -13,11 +13,11 @@ ROOMS = [
     for name, paths, lines, budget in re.findall(r"^\| ([^|`]+) \| (`[^|]+) \| ([\d,]+) \| ([\d,]+) \|$", PAGE, re.M)
 ]
 TOTALS = {
-    "library without hardware": 19_230,
+    "library without hardware": 21_420,
     "hardware": 5_080,
-    "experiments": 4_030,
-    "benchmarks": 4_470,
-    "tests": 18_150,
+    "experiments": 5_160,
+    "benchmarks": 4_700,
+    "tests": 20_720,
 }
 
 
