@@ -217,8 +217,8 @@ class Predictor:
         even if the first frame lacks some. A predicted tactile image without contact is ignored like a given one.
 
         A state-space model infers the state from the first frame alone, in which the object is at rest. Without a key,
-        each step is the likeliest one. With `num_samples`, the result has the mean images and the central poses of the
-        sampled courses.
+        each step is the likeliest one. With a key, each step draws one of the motions that are possible. With
+        `num_samples`, the result has the mean images and the central poses of the sampled courses.
 
         Args:
             frame: First frame: a `Frame`, a `Prediction` of one frame, or a mapping with some of `visual`, `tactile`

@@ -9,7 +9,7 @@ import pytest
 from test_evaluation_results import FELL, RESTS, judged, pairs
 
 import sts_jax as sts
-from sts_jax import dataset, evaluation, physics, training
+from sts_jax import dataset, evaluation, physics, statespace, training
 from sts_jax.evaluation import references
 from sts_jax.physics.arguments import check_start
 
@@ -158,6 +158,19 @@ def test_frames_that_no_number_of_steps_connects_are_refused(frames, message):
     test = later(2)._replace(frame=None if frames is None else np.array(frames))
     with pytest.raises(ValueError, match=message):
         evaluation.predict(Riser(), ("visual", "pose"), test, physics.Freefall())
+
+
+def test_a_state_space_model_is_only_rolled_out_from_frame_0():
+    """The engine's object at frame 4 moves, but a roll-out of this model would begin at rest."""
+    model = Riser()
+    model.model = types.SimpleNamespace(config=statespace.Config(inputs=("visual",), outcomes=1, stride=2))
+    known = ("visual", "pose"), later(2, 4, 10), physics.Freefall()
+    for function, more in ((evaluation.predict, {}), (evaluation.rollout, {"steps": 3})):
+        with pytest.raises(ValueError, match=r"begin at frame 4, but .* at rest, as in frame 0: .*frames=\(0, t\)"):
+            function(model, *known, **more)
+        assert model.calls == []
+    evaluation.predict(model, ("visual", "pose"), later(2), physics.Freefall())
+    assert model.calls[0]["steps"] == 3
 
 
 def test_a_model_of_the_last_frame_is_not_rolled_out():

@@ -16,7 +16,7 @@ from statespace_config import STATE, finite, random_codes, random_states, same, 
 from sts_jax import objects, statespace, storage
 from sts_jax.mvae import Gaussian
 from sts_jax.statespace import networks, objective, poses, state
-from sts_jax.statespace.rollout import _Course, step
+from sts_jax.statespace.rollout import _Course, _motions, step
 
 CONFIG = dataclasses.replace(STATE, outcomes=1, stride=1, drawn=0.5, drawn_first=0.5)
 NUMBER, FRAMES = 4, 7
@@ -195,6 +195,27 @@ def test_courses_are_rigid_and_an_item_does_not_depend_on_the_others(batch, roll
     assert np.abs(np.diff(rolled.pose, axis=1)).max() > 1e-3
 
 
+def test_a_sampled_step_is_the_mean_of_a_drawn_component_unless_the_object_rests():
+    """The second item most probably rests, and the third one has a heading of 90 degrees."""
+    share, num = np.array([[0.5, 0.2, 0.3], [0.35, 0.25, 0.4], [0.5, 0.2, 0.3]]), 1000
+    mean = np.random.default_rng(0).normal(size=(3, 6))
+    angle = np.array([[1.0, 0], [1, 0], [0, 1]])
+    parts = np.log([[1]] * 3), np.log(share)[:, None], np.tile(mean, (3, 1, 1, 1)), np.zeros((3, 1, 3, 6)), angle
+    density = networks.FinalPose(*(jnp.asarray(np.tile(x, (num, *[1] * (x.ndim - 1))), jnp.float32) for x in parts))
+    run = jax.jit(_motions, static_argnames="num")
+    found = np.asarray(run(jax.random.split(jax.random.key(0), 3), density, num)).reshape(num, 3, 6)
+    turned = [np.kron(np.eye(2), Rotation.from_euler("z", degrees, degrees=True).as_matrix()) for degrees in (0, 0, 90)]
+    chosen = []
+    for i, expected in enumerate([share[0], [0, 0, 1], share[2]]):
+        distance = np.linalg.norm(found[:, i, None] - mean @ turned[i].T, axis=-1)
+        np.testing.assert_allclose(distance.min(1), 0, atol=1e-5)
+        chosen.append(distance.argmin(1))
+        np.testing.assert_allclose(np.bincount(chosen[i], minlength=3) / num, expected, atol=0.06)
+    assert (chosen[0] != chosen[2]).any()  # each item has draws of its own
+    alone = np.asarray(run(None, jax.tree.map(lambda x: x[:3], density), 1))
+    np.testing.assert_allclose(alone, [mean[0], mean[2], turned[2] @ mean[0]], atol=1e-5)
+
+
 def test_an_object_below_the_pad_keeps_its_pose(batch, roll):
     code = batch["targets"]["state"]
     low = code.at[:2, 2].set(-3.0)
@@ -285,7 +306,7 @@ def coasting(rng, number, frames=11):
 
 
 def test_the_transition_learns_a_fall_and_a_push_of_known_duration():
-    """Falls of 100 mm and pushes of up to 115 mm: after 10 steps, the median error of a coordinate is below 8 mm."""
+    """The error after 10 steps is less than a quarter of the way. With a push that never ends, it would be a third."""
     config = dataclasses.replace(CONFIG, transition=64, inputs=("visual",), components=2)
     graphdef, params, _ = statespace.init(jax.random.key(0), config)
     data, test = coasting(np.random.default_rng(0), 4096), coasting(np.random.default_rng(1), 32)
@@ -314,9 +335,9 @@ def test_the_transition_learns_a_fall_and_a_push_of_known_duration():
     rolled = jax.jit(functools.partial(statespace.rollout, graphdef, steps=frames - 1))(
         params, None, {"state": test["state"]}, one, blank, test["condition"][:, :-1]
     )
-    error = SCALE * np.abs(np.swapaxes(rolled.pose[:, 0], 0, 1) - test["course"][:, 1:])[..., :3]
-    assert np.median(error[:, -1]) < 0.008
-    assert error[:, -1].mean() < 0.012
+    error = np.abs(rolled.pose[-1, 0, :, :3] - test["course"][:, -1, :3]).mean(0)
+    way = np.abs(test["course"][:, -1, :3] - test["course"][:, 0, :3]).mean(0)  # the error of the start velocity, 0
+    assert (error < way / 4).all()
 
 
 def test_courses_before_frame_0_are_at_rest(model, batch, roll):

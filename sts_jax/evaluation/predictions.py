@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sts_jax import physics, training
+from sts_jax import physics, statespace, training
 from sts_jax._checked import in_32_bits
 from sts_jax.dataset import Dataset, Pairs
 from sts_jax.dataset.measurement import NAMES
@@ -132,7 +132,8 @@ def predict(
 ) -> Predicted:
     """Predict the second frames of held-out pairs with a model, from some of the inputs of the first frames.
 
-    A one-step model (`Predictor.stride`) is rolled out from `test.frame[:, 0]` to `test.frame[:, 1]`. The predicted
+    A one-step model (`Predictor.stride`) is rolled out from `test.frame[:, 0]` to `test.frame[:, 1]`. A state-space
+    model is only rolled out from frame 0, because its roll-out begins with an object at rest. The predicted
     outcome follows from the predicted pose. Outcome probabilities are those of the model, or the shares of the outcomes
     among its samples. A model of the visual image without a pose gets an outcome if the scenario has two outcomes and
     `validation` and `blank` are given: `FELL_OFF` if the image shows no object.
@@ -178,6 +179,7 @@ def rollout(
     _check(names, test)
     if predictor.preprocessing.stride is None:
         raise ValueError("the predictor predicts the last frame, and has no steps: use evaluation.predict")
+    _check_begin(predictor, test)
     predicted = _predicted(predictor, names, test, num_samples, steps, last=False)
     return [_judged(out, test, scenario) for out in predicted]
 
@@ -202,6 +204,7 @@ def _steps(predictor: Any, pairs: Pairs) -> int | None:
         return None
     if pairs.frame is None:
         raise ValueError("the pairs have no `frame`, which a one-step model needs: make them with Dataset.pairs")
+    _check_begin(predictor, pairs)
     apart = np.unique(pairs.frame[:, 1] - pairs.frame[:, 0])
     if len(apart) > 1 or apart[0] < stride or apart[0] % stride:
         raise ValueError(
@@ -209,6 +212,16 @@ def _steps(predictor: Any, pairs: Pairs) -> int | None:
             f"takes {stride}: make the pairs with Dataset.pairs(..., frames=(t, t + k * {stride})) for one k >= 1"
         )
     return int(apart[0]) // stride
+
+
+def _check_begin(predictor: Any, pairs: Pairs) -> None:
+    """Raise a ValueError if pairs begin at a frame from which a state-space model cannot be rolled out."""
+    config = getattr(getattr(predictor, "model", None), "config", None)
+    if isinstance(config, statespace.Config) and pairs.frame is not None and pairs.frame[:, 0].any():
+        raise ValueError(
+            f"the pairs begin at frame {pairs.frame[:, 0].max()}, but a roll-out of a state-space model begins with an "
+            "object at rest, as in frame 0: make the pairs with Dataset.pairs(..., frames=(0, t))"
+        )
 
 
 def _judged(out: Predicted, test: Pairs, scenario: physics.Scenario) -> Predicted:

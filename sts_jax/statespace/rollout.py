@@ -1,7 +1,10 @@
 """Roll-outs of one-step models: courses of poses from the belief about the first frame, and their images.
 
-A course is k poses that follow each other. Each step draws a motion from the density that the transition predicts. The
+A course is a sequence of poses. Each step draws a component of the density that the transition predicts, and moves the
+object by the mean of this component. An object that is most probably at rest stays at rest. The noise of a component is
+not drawn: velocities integrate it, so that independent noise at each step would carry the object off the pad. The
 belief about the first frame is moved along the course, so that its uncertainty about shape and rotation stays the same.
+
 The decoder runs after the roll-out, and only for the frames that are asked for, because an image costs much more than a
 step, and convolutions in `lax.scan` are slow on a CPU.
 """
@@ -52,12 +55,13 @@ def rollout(
 ) -> Rollout:
     """Roll out a one-step model from inputs of the first frame.
 
-    Each course begins at a pose that is drawn from the belief, at rest. An object that has left the pad keeps its pose,
-    as in the simulation.
+    Each course begins at a pose that is drawn from the belief, at rest. In each step, it draws one of the components of
+    the density, unless the component of resting objects is the likeliest. An object that has left the pad keeps its
+    pose, as in the simulation.
 
     Args:
         key: As in `sample`, for n items. None for courses without random draws: they begin at the mean pose, and each
-            step is the mean of the likeliest component of the density.
+            step takes the likeliest component.
         condition: From `training.Preprocessing.encode_condition`, at the beginning of each step, or None.
         steps: Number of steps.
         num: Number of courses of each item.
@@ -100,7 +104,7 @@ def step(
     """Advance k courses of each item by one step.
 
     Args:
-        key: A key for each item. None for the mean of the likeliest component.
+        key: A key for each item. None for the likeliest component.
         known: Belief about the state code in the first frame, `(n, code)`.
         condition: At the beginning of the step.
     """
@@ -122,20 +126,15 @@ def step(
 
 
 def _motions(key: Key[Array, "n"] | None, density: FinalPose, num: int) -> Float[Array, "kn 6"]:
-    """Draw a motion of each course in the sensor frame, or return the mean of the likeliest component."""
-    weight, mean, log_var = density.weight[:, 0], density.mean[:, 0], density.log_var[:, 0]
-    if key is None:
-        chosen = jnp.argmax(weight, axis=-1)
-    else:
-        which, noise = jax.vmap(lambda key: jax.random.split(key, 2), out_axes=1)(key)
+    """The motion of each course in the sensor frame: the mean of a drawn component, or of the likeliest one."""
+    weight, mean = density.weight[:, 0], density.mean[:, 0]
+    chosen = jnp.argmax(weight, axis=-1)
+    if key is not None:
         shares = weight.reshape(num, -1, weight.shape[-1])
         draw = jax.vmap(lambda key, log: jax.random.categorical(key, log, axis=-1), in_axes=(0, 1), out_axes=1)
-        chosen = draw(which, shares).reshape(-1)
-    mean, log_var = (jnp.take_along_axis(x, chosen[:, None, None], axis=1)[:, 0] for x in (mean, log_var))
-    if key is not None:
-        normal = jax.vmap(lambda key: jax.random.normal(key, (num, poses.MOTION)), out_axes=1)(noise)
-        mean += jnp.exp(0.5 * log_var) * normal.reshape(mean.shape)
-    return poses.turn_motion(density.heading, mean)
+        rests = chosen == weight.shape[-1] - 1
+        chosen = jnp.where(rests, chosen, draw(key, shares).reshape(-1))
+    return poses.turn_motion(density.heading, jnp.take_along_axis(mean, chosen[:, None, None], axis=1)[:, 0])
 
 
 def _first_poses(key: Key[Array, "n"] | None, known: Gaussian, num: int) -> Float[Array, "num n 12"]:
