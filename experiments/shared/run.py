@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple, TypeVar
 
+import jax.numpy as jnp
 import numpy as np
 import tyro
 
@@ -19,6 +20,7 @@ from sts_jax.compilation import cache_folder
 from sts_jax.training import TrainConfig
 
 Stage = Literal["collect", "train", "evaluate"]
+Skin = Literal["hazy", "clear"]
 Preset = TypeVar("Preset")  # type of a configuration
 # Fields of the configuration that have no effect on the training of each kind of models
 WITHOUT_EFFECT = {
@@ -40,6 +42,9 @@ class Args:
     # each range (off), a wider range of friction (wide-friction), or contents that may lie on any side of the
     # object (off-centre)
     hidden: sts.physics.Variant = "default"
+    # skin of the sensor, which the camera looks through: the sensor's default (hazy), or one without haze, scattered
+    # light, tint and shadows, as in the paper's code (clear)
+    skin: Skin = "hazy"
     objects: Path | None = None  # folder of mesh files or of ShapeNetSem, whose objects replace the procedural ones
     # classes of the objects. Empty: those of the experiment, or all classes of --objects if it has none of these
     classes: tuple[str, ...] = ()
@@ -59,7 +64,7 @@ def command(presets: Mapping[str, Config], workdir: str, description: str | None
     with on_one_line(debug="debug" in options(sys.argv[1:])):
         args = parse(presets, workdir, description)
         sts.enable_compilation_cache()
-        main(configure(args), args.workdir, only=args.only)
+        main(configure(args), args.workdir, only=args.only, skin=args.skin)
 
 
 def parse(presets: Mapping[str, Config], workdir: str, description: str | None) -> Args:
@@ -164,7 +169,18 @@ def with_meshes(collection: dataset.Collection, folder: Path, args: Args) -> dat
     return collection
 
 
-def main(config: Config, workdir: Path, *, only: Stage | None = None, own: Extensions = NONE) -> None:
+def sensor(skin: Skin) -> sts.Sensor:
+    """The sensor of an experiment. A `clear` skin only transmits light."""
+    default = sts.Sensor()
+    if skin == "hazy":
+        return default
+    room = dataclasses.replace(default.room, haze=1e3, milk=0.0, tint=jnp.ones(3), crease=0.0, vignette=0.0)
+    return dataclasses.replace(default, room=room)
+
+
+def main(
+    config: Config, workdir: Path, *, only: Stage | None = None, own: Extensions = NONE, skin: Skin = "hazy"
+) -> None:
     """Collect the dataset, train the models, evaluate them, and print the main table.
 
     Args:
@@ -172,17 +188,17 @@ def main(config: Config, workdir: Path, *, only: Stage | None = None, own: Exten
         workdir: Work directory for the results.
         only: Stage to run, with the results of the earlier stages in `workdir`. None: all stages.
         own: Your own loss, optimiser, logger, metrics and modalities.
+        skin: Skin of the sensor that collects the dataset. The later stages use the sensor of the dataset.
     """
     check(config, own)
-    sensor = sts.Sensor()
     with storage.lock(workdir, finished=True):
         storage.claim(workdir / "config.json", dataclasses.asdict(config), storage.default_fields(config))
         folder = workdir / "dataset"
-        data = collect(config.collection, sensor, folder) if only in (None, "collect") else dataset.load(folder)
+        data = collect(config.collection, sensor(skin), folder) if only in (None, "collect") else dataset.load(folder)
         if only == "collect":
             return
         for split in config.splits:
-            run = Run(config, workdir, sensor, split)
+            run = Run(config, workdir, sts.Sensor.load(folder / "sensor.json"), split)
             if only in (None, "train"):
                 train(run, data, own)
             if only in (None, "evaluate"):
