@@ -108,9 +108,9 @@ CONDITIONS: dict[str, tuple[str, Callable[[World], World]]] = {
     "default": ("", lambda world: world),
     **CHANGES,
     "all": ("all of the above", together),
-    "all-but-crop": ("all but --collection.crop", lambda world: together(world, ("crop",))),
+    "all-but-crop": ("all but crop", lambda world: together(world, ("crop",))),
     "all-but-few": (
-        "all but few objects and --splits trajectory",
+        "all but few and trajectory",
         lambda world: together(world, ("trajectory", "few")),
     ),
     "training": ("--training.learning-rate 1e-3 --training.schedule constant", paper_training),
@@ -199,7 +199,8 @@ def measure(cell: Cell, args: Args) -> dict[str, Any]:
     run.train_model(job, folder, "own", validation=held_out)
     mean = train.visual[:, 1].mean(0) / 255
     last, best = (sts.Predictor.load(path) for path in (folder, folder / "best"))
-    shown = evaluation.figures.sheets.one_of_each(test, dataset.class_names(world.collection), SHOWN)
+    rest = np.flatnonzero(test.outcome == int(physics.Outcome.RESTS))
+    shown = rest[evaluation.figures.sheets.one_of_each(test.take(rest), dataset.class_names(world.collection), SHOWN)]
     predicted = last(visual=test.visual[shown, 0] / 255).visual
     np.savez(folder / "shown.npz", pairs=test.visual[shown], predicted=np.round(255 * np.asarray(predicted)))
     found = {"last": scores(last, test, mean), "best": scores(best, test, mean), "best_step": best.model.step}
