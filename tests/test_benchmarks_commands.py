@@ -9,7 +9,7 @@ import pytest
 import tyro
 
 import sts_jax
-from benchmarks import device, faults, gap, hidden, shipped
+from benchmarks import device, faults, gap, hidden, sharpness, shipped
 
 ROOT = Path(__file__).parent.parent
 SOURCES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/**/*.md"), *ROOT.glob("benchmarks/**/*.py")]
@@ -57,6 +57,8 @@ PERTURBED = Path(sts_jax.__file__).parent / "models" / "perturbed"
         (lambda: gap.main(gap.Args(trajectories=9)), "--trajectories must be >= 10, got 9"),
         (lambda: gap.main(gap.Args(resolution=(64, 64))), "must have the aspect ratio"),
         (lambda: hidden.Args(soaked=Path("a"), objects=200), "--soaked provides the trajectories"),
+        (lambda: sharpness.Args(("fog",)), r"unknown conditions \['fog'\]"),
+        (lambda: sharpness.Args(trajectories=50), "--trajectories must be a multiple of 24, at least 48, got 50"),
         (lambda: shipped.main(shipped.Args("perturbed", objects=4)), "--objects must be at least 5, got 4"),
         (lambda: shipped.main(shipped.Args("freefall", trained=PERTURBED)), "perturbed has outcomes=4 and condition=3"),
     ],

@@ -77,15 +77,16 @@ def test_the_preset_paper_has_the_counts_of_the_paper(experiment, classes, traje
 
 def test_options_reach_the_experiment(tmp_path, monkeypatch):
     ran = []
-    monkeypatch.setattr(run, "main", lambda config, workdir, only: ran.append((config, workdir, only)))
-    monkeypatch.setattr("sys.argv", ["freefall", "--hidden", "off", "--classes", "fork", "bottle", "--parts"])
+    monkeypatch.setattr(run, "main", lambda config, workdir, only, skin: ran.append((config, workdir, only, skin)))
+    options = ["--hidden", "off", "--classes", "fork", "bottle", "--parts", "--skin", "clear"]
+    monkeypatch.setattr("sys.argv", ["freefall", *options])
     run.command(freefall.PRESETS, str(tmp_path), "What it does.")
     other = ["--preset", "smoke", "--workdir", str(tmp_path / "other"), "--only", "train"]
     monkeypatch.setattr("sys.argv", ["freefall", *other])
     run.command(freefall.PRESETS, str(tmp_path), None)
     scenario = physics.variant(physics.Freefall(), "off")
     asked = changed(freefall.DEFAULT, {"scenario": scenario, "categories": ("fork", "bottle"), "parts": True})
-    assert ran == [(asked, tmp_path, None), (freefall.SMOKE, tmp_path / "other", "train")]
+    assert ran == [(asked, tmp_path, None, "clear"), (freefall.SMOKE, tmp_path / "other", "train", "hazy")]
     assert list(tmp_path.iterdir()) == []
 
 
