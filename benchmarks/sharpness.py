@@ -127,7 +127,7 @@ class Args:
     workdir: Path = Path("runs/sharpness")  # folder of the datasets and models
     steps: int = 400  # training steps
     trajectories: int = 480  # trajectories of each condition, a multiple of 24
-    longer: tuple[str, ...] = ("default", "crop", "all")  # conditions that are also trained four times as long
+    longer: tuple[str, ...] = ("crop", "all")  # conditions that are also trained four times as long
     repeated: tuple[str, ...] = ("default", "all")  # conditions that are repeated with the further seeds
     seeds: tuple[int, ...] = (1, 2)  # further seeds
 
@@ -250,13 +250,14 @@ def skill(predicted: np.ndarray, test: dataset.Pairs, mean: np.ndarray, mask: np
 
 def row(cell: Cell, found: dict[str, Any], weights: str = "last") -> str:
     """A row of the table."""
-    best = f", best weights (step {found['best_step']})" if weights == "best" else ""
-    one = found[weights]
+    name, one, seen = cell.condition, found[weights], found["seen"]
     values = [one["skill"], one["object"], one["sharpness"], one["sample"]]
-    values += [found["seen"]["skill"], found["copy"]] if weights == "last" else []
-    written = [f"{value:.3f}" for value in values] + ["-"] * (6 - len(values))
-    name = f"{cell.condition}{best}"
-    return " | ".join([f"| {name:28s}", f"{cell.steps:5d}", f"{cell.seed}", *(f"{x:>6s}" for x in written)]) + " |"
+    if weights == "last":
+        values += [seen["skill"], seen["sharpness"], found["copy"]]
+    else:
+        name += f", best weights (step {found['best_step']})"
+    written = [f"{value:.3f}" for value in values] + ["-"] * (7 - len(values))
+    return f"| {' | '.join([name, str(cell.steps), str(cell.seed), *written])} |"
 
 
 def draw(path: Path, folders: dict[str, Path]) -> None:
@@ -277,14 +278,15 @@ def main(args: Args) -> str:
     """Measure all cells, draw the picture, and return the table."""
     sts.enable_compilation_cache()
     lines = [
-        f"{'| condition':30s} | steps | seed | skill | skill on the object | sharpness of the mean | "
-        "sharpness of a sample | skill on training items | skill of a copy of the input |",
-        "|---" * 9 + "|",
+        "| condition | steps | seed | skill | skill on the object | sharpness of the mean | sharpness of a sample | "
+        "skill, training items | sharpness, training items | skill of a copy of the input |",
+        "|---" * 10 + "|",
     ]
     folders = {}
     for cell in cells(args):
         found = measure(cell, args)
-        folders[f"{cell.condition}\n{cell.steps} steps"] = args.workdir / "cells" / cell.name
+        if cell.seed == 0:
+            folders[f"{cell.condition}\n{cell.steps} steps"] = args.workdir / "cells" / cell.name
         for weights in ("last", "best") if cell.condition in args.longer else ("last",):
             lines.append(row(cell, found, weights))
             print(lines[-1], flush=True)
