@@ -245,6 +245,7 @@ def test_one_stage_runs_on_the_results_of_the_stages_before_it(tmp_path, monkeyp
         run.main(freefall.SMOKE, tmp_path, only="train")
     monkeypatch.setattr(run, "collect", lambda *_: ran.append("collect"))
     monkeypatch.setattr(dataset, "load", lambda folder: None)
+    run.sensor("clear").save(tmp_path / "dataset" / "sensor.json")  # of the dataset, which the later stages use
     for only in ("collect", "train", "evaluate", None):
         run.main(freefall.SMOKE, tmp_path, only=only)
     assert ran == [*(stages := ["collect", "train", "evaluate"]), *stages]
