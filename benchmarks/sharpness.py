@@ -21,6 +21,7 @@ from typing import Any
 import jax
 import numpy as np
 import tyro
+from PIL import Image
 
 import sts_jax as sts
 from benchmarks.instruments.experiments import EXPERIMENTS
@@ -34,6 +35,7 @@ LONGER = 4  # factor of the steps of a longer training
 SHOWN = 3  # held-out items of a condition in the picture
 FEW = 24  # objects of the condition `few`, three of each class
 _SIZE = 64  # pixels
+_COLOURS = 128  # colours in the picture, few to keep the file small
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,6 +110,7 @@ CONDITIONS: dict[str, tuple[str, Callable[[World], World]]] = {
     "default": ("", lambda world: world),
     **CHANGES,
     "all": ("all of the above", together),
+    "crop-near": ("crop and near", lambda world: together(world, tuple({*CHANGES} - {"crop", "near"}))),
     "all-but-crop": ("all but crop", lambda world: together(world, ("crop",))),
     "all-but-few": (
         "all but few and trajectory",
@@ -272,6 +275,9 @@ def draw(path: Path, folders: dict[str, Path]) -> None:
     heads = [f"held-out item {item + 1}" for item in range(count)]
     title = "Paper's visual-only VAE on freefall: conditions changed one at a time"
     evaluation.figures.comparison(path, groups, list(folders), title=title, heads=heads)
+    with Image.open(path) as image:
+        smaller = image.convert("RGB").reduce(2).quantize(_COLOURS)
+    smaller.save(path)
 
 
 def main(args: Args) -> str:
@@ -287,7 +293,7 @@ def main(args: Args) -> str:
         found = measure(cell, args)
         if cell.seed == 0:
             folders[f"{cell.condition}\n{cell.steps} steps"] = args.workdir / "cells" / cell.name
-        for weights in ("last", "best") if cell.condition in args.longer else ("last",):
+        for weights in ("last", "best") if cell.condition in ("default", *args.longer) else ("last",):
             lines.append(row(cell, found, weights))
             print(lines[-1], flush=True)
         draw(args.workdir / "sharpness.png", folders)
