@@ -1,6 +1,6 @@
 """Find out which difference from the paper's world makes the predictions of a paper model sharp.
 
-    python -m benchmarks.sharpness               # about half an hour on two CPU cores, can be stopped and started again
+    python -m benchmarks.sharpness               # about 40 minutes on two CPU cores, can be stopped and started again
     python -m benchmarks.sharpness crop all      # two of the conditions
 
 Each condition changes one thing in a small freefall experiment with the default view, collects its own trajectories,
@@ -35,7 +35,7 @@ LONGER = 4  # factor of the steps of a longer training
 SHOWN = 3  # held-out items of a condition in the picture
 FEW = 24  # objects of the condition `few`, three of each class
 _SIZE = 64  # pixels
-_COLOURS = 128  # colours in the picture, few to keep the file small
+_COLOURS = 48  # colours in the picture, few to keep the file small
 
 
 @dataclasses.dataclass(frozen=True)
