@@ -35,7 +35,7 @@ LONGER = 4  # factor of the steps of a longer training
 SHOWN = 3  # held-out items of a condition in the picture
 FEW = 24  # objects of the condition `few`, three of each class
 _SIZE = 64  # pixels
-_COLOURS = 48  # colours in the picture, few to keep the file small
+_COLOURS = 96  # colours in the picture, few to keep the file small
 
 
 @dataclasses.dataclass(frozen=True)
