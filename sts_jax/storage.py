@@ -198,9 +198,10 @@ def _filled(recorded: Any, content: Any, defaults: dict) -> Any:
     """A recorded content with the defaults of the fields that it lacks, of those that the new content has."""
     if not isinstance(recorded, dict) or not isinstance(content, dict):
         return recorded
-    lacking = {name: value for name, value in defaults.items() if name in content and not isinstance(value, dict)}
-    parts = {name: part for name, part in defaults.items() if name in recorded and isinstance(part, dict)}
-    return lacking | recorded | {name: _filled(recorded[name], content.get(name), part) for name, part in parts.items()}
+    inner = {name: part for name, part in defaults.items() if isinstance(part, dict)}
+    parts = {name: _filled(recorded[name], content.get(name), inner[name]) for name in inner if name in recorded}
+    lacking = {name: defaults[name] for name in defaults.keys() & content.keys() - recorded.keys() - inner.keys()}
+    return recorded | parts | lacking
 
 
 _SHOWN = 3  # number of differing fields whose values a message contains

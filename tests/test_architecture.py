@@ -13,11 +13,11 @@ ROOMS = [
     for name, paths, lines, budget in re.findall(r"^\| ([^|`]+) \| (`[^|]+) \| ([\d,]+) \| ([\d,]+) \|$", PAGE, re.M)
 ]
 TOTALS = {
-    "library without hardware": 21_420,
+    "library without hardware": 21_430,
     "hardware": 5_080,
-    "experiments": 5_160,
-    "benchmarks": 4_700,
-    "tests": 20_720,
+    "experiments": 5_170,
+    "benchmarks": 5_010,
+    "tests": 20_850,
 }
 
 
