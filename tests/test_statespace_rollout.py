@@ -406,8 +406,9 @@ def test_a_predictor_rolls_out_with_the_time_of_each_step(predictor):
     empty = {name: jnp.asarray(image) for name, image in predictor.empty.items()}
     rolled = statespace.rollout(*parts, empty, jnp.asarray(condition, jnp.float32), steps=3)
     expected = view.decode_pose(jnp.moveaxis(rolled.pose[:, 0], 0, 1))
-    np.testing.assert_allclose(out.pose, expected, atol=1e-5)
-    assert np.abs(np.diff(out.pose, axis=1)).max((0, 2)).min() > 1e-5
+    np.testing.assert_allclose(out.pose, expected, atol=3e-4)
+    other = predictor.rollout(given, 3, condition=GIVEN_CONDITION, time=0.7)
+    assert np.abs(other.pose - out.pose).max((0, 2)).min() > 1e-3
     assert out.visual.shape == out.tactile.shape == (2, 3, 16, 16, 3)
     assert out.mean.shape == (2, 3, rolled.belief.mean.shape[1])
     assert out.samples is out.outcome_probability is None
