@@ -68,6 +68,7 @@ def test_a_rollout_applies_the_model_to_its_own_predictions(names):
     close(one_step().rollout(given, 4, last=True), jax.tree.map(lambda x: x[:, 3:], out))
 
 
+@pytest.mark.slow
 def test_a_predicted_tactile_image_without_contact_is_ignored_like_a_given_one():
     given = measurement(6)
     given["tactile"][0] = GREY

@@ -313,6 +313,7 @@ def coasting(rng, number, frames=11):
     return falls | {"condition": jnp.asarray(condition, jnp.float32)}
 
 
+@pytest.mark.slow
 def test_the_transition_learns_a_fall_and_a_push_of_known_duration():
     """The error after 10 steps is less than a quarter of the way. With a push that never ends, it would be a third."""
     config = dataclasses.replace(CONFIG, transition=64, inputs=("visual",), components=2)
@@ -395,6 +396,7 @@ def first_frames():
     return {"visual": rng.random((2, 32, 32, 3), np.float32), "pose": pose.astype(np.float32)}
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:(visual|tactile|pose) ")
 def test_a_predictor_rolls_out_with_the_time_of_each_step(predictor):
     given, view = first_frames(), predictor.preprocessing
@@ -416,6 +418,7 @@ def test_a_predictor_rolls_out_with_the_time_of_each_step(predictor):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b[:, 2:], atol=1e-5), last, out)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:(visual|tactile|pose) ")
 def test_samples_of_a_predictor_are_courses_with_mean_images_and_central_poses(predictor):
     known = {"condition": GIVEN_CONDITION, "key": jax.random.key(2), "num_samples": 3}

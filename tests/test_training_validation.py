@@ -79,7 +79,7 @@ def test_a_blank_written_after_the_training_is_in_both_folders(tmp_path):
         training.load(folder)
 
 
-@pytest.mark.parametrize("step", [1, 3, 6, 9])
+@pytest.mark.parametrize("step", [1, *(pytest.param(step, marks=pytest.mark.slow) for step in (3, 6, 9))])
 def test_a_killed_run_has_the_same_log_and_the_same_best_weights(finished, tmp_path, step):
     training.save_blank(tmp_path, IMAGE, IMAGE)
     training.claim_split(tmp_path, ROWS)
@@ -90,7 +90,7 @@ def test_a_killed_run_has_the_same_log_and_the_same_best_weights(finished, tmp_p
 
 
 @pytest.mark.parametrize("place", ["best", "model"])
-@pytest.mark.parametrize("at", [2, 4, 10])
+@pytest.mark.parametrize("at", [4, *(pytest.param(at, marks=pytest.mark.slow) for at in (2, 10))])
 def test_a_kill_while_weights_are_written_loses_nothing(finished, tmp_path, monkeypatch, place, at):
     """A killed process does not run `finally`, so the test also disables the cleaning."""
     write = storage.write_manifest
