@@ -1,6 +1,7 @@
 """The benchmark of the conditions for sharp pictures: what each condition changes, and a tiny run."""
 
 import dataclasses
+import types
 
 import numpy as np
 import pytest
@@ -57,13 +58,10 @@ def test_all_has_every_change_and_a_clear_skin_only_transmits():
 
 
 def test_parts_of_both_splits_are_disjoint_and_equally_large(monkeypatch):
-    class Data:
-        collection = {"shares": (0.7, 0.1, 0.2)}  # noqa: RUF012
-        rendered = staticmethod(lambda: np.arange(100))
-
+    data = types.SimpleNamespace(collection={"shares": (0.7, 0.1, 0.2)}, rendered=lambda: np.arange(100))
     both = {"train": np.arange(80), "validation": np.arange(80), "test": np.arange(80, 100)}
     monkeypatch.setattr(sharpness.evaluation, "rows_of", lambda *_: both)
-    parts = sharpness.parts(Data, "trajectory")
+    parts = sharpness.parts(data, "trajectory")
     assert [len(part) for part in parts] == [70, 10, 20]
     assert sorted(np.concatenate(parts)) == list(range(100))
 
