@@ -200,7 +200,7 @@ def _filled(recorded: Any, content: Any, defaults: dict) -> Any:
         return recorded
     inner = {name: part for name, part in defaults.items() if isinstance(part, dict)}
     parts = {name: _filled(recorded[name], content.get(name), inner[name]) for name in inner if name in recorded}
-    lacking = {name: defaults[name] for name in defaults.keys() & content.keys() - recorded.keys() - inner.keys()}
+    lacking = {name: value for name, value in defaults.items() if name in content and name not in {**recorded, **inner}}
     return recorded | parts | lacking
 
 
