@@ -7,6 +7,7 @@ from sts_jax import mvae as mvae
 from sts_jax import objects as objects
 from sts_jax import optics as optics
 from sts_jax import physics as physics
+from sts_jax import scene as scene
 from sts_jax import storage as storage
 from sts_jax import tactile as tactile
 from sts_jax import training as training
