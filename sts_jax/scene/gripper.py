@@ -21,6 +21,7 @@ BOX = (0.03, 0.04, 0.05)  # m, size of the object without a `Body`
 REACH = 0.15  # m, from the middle of the sensors up to the palm
 MAST = 0.3  # m, largest height of the middle of the sensors
 HAND_MASS, FINGER_MASS = 0.6, 0.1  # kg
+SLIPPERY = 1e-5  # friction of all geoms but the object: two geoms without friction make NaN in MJX (C takes this value)
 LIFT_GAINS = 2e4, 400.0  # N/m, N s/m, of the servo that lifts the hand: 22 Hz, critically damped with a full hand
 GRIP_GAINS = 4e3, 40.0  # N/m, N s/m, of the servo that closes the fingers, whose force is limited
 
@@ -28,7 +29,7 @@ _SCENE = """
 <mujoco model="gripper">
   <option timestep="{timestep}" cone="elliptic" impratio="10" integrator="implicitfast"/>
   <default>
-    <geom condim="6" friction="0 0 0" solref="0.004 1"/>
+    <geom condim="6" friction="{slippery} {slippery} {slippery}" solref="0.004 1"/>
     <default class="shown"><geom type="box" contype="0" conaffinity="0" mass="0" rgba=".25 .27 .3 1"/></default>
   </default>
   <asset>{mesh}</asset>
@@ -143,6 +144,7 @@ def gripper(
     ]
     xml = _SCENE.format(
         timestep=timestep,
+        slippery=SLIPPERY,
         mesh=mesh,
         height=height,
         reach=REACH,
