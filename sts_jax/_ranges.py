@@ -1,6 +1,7 @@
 """Allowed ranges of a dataclass's fields, declared in their metadata, as in `field(default=4 / 3, metadata=POSITIVE)`.
 
-The metadata's keys are "above" (>), "at_least" (>=), "below" (<), "at_most" (<=), "whole" and "static".
+The metadata's keys are "above" (>), "at_least" (>=), "below" (<), "at_most" (<=), "whole" and "static". The key
+"metres" is the power of the unit metre in a constant of the sensor (`Sensor.sized`).
 """
 
 import dataclasses
@@ -15,6 +16,7 @@ SHARE = {"at_least": 0.0, "at_most": 1.0}
 NUMBER = {"at_least": 0, "at_most": 2**32 - 1, "whole": True}
 COUNT = {"at_least": 1, "at_most": 10**9, "whole": True}
 MOST_PIXELS = 8192  # height or width of an image
+LENGTH = {"metres": 1}
 STATIC = {"static": True}  # JAX compiles a program for each value of the field
 
 _LARGEST = 2**32  # whole numbers must be smaller, because JAX has 32 bits for a seed

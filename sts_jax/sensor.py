@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import functools
+import math
 import os
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -22,6 +23,7 @@ from sts_jax.tactile import Gel, Leds, Lights, Phong, Skin
 _LIGHTS: dict[str, type[Lights] | type[Leds]] = {"Lights": Lights, "Leds": Leds}  # by `lights.kind` in a file
 _LARGEST = float(np.finfo(np.float32).max)  # larger numbers become inf in float32
 _ROUNDED = 1 + 1e-6  # factor that tolerates rounding to float32
+_SMALLEST, _WIDEST = 0.001, 1.0  # m, sides of a pad
 
 _Condition = tuple[Any, Callable[[], str]]  # flag, True if the condition holds, and a function that makes the message
 
@@ -43,6 +45,51 @@ class Sensor:
     room: Room = dataclasses.field(default_factory=Room)  # External light, and the view of it through the skin.
     # Images whose shorter side is below this number of pixels are sampled every half pixel and filtered. Our choice.
     fine_below: int = dataclasses.field(default=128, metadata=NOT_NEGATIVE | STATIC)
+
+    @classmethod
+    def sized(cls, width: float, height: float | None = None, *, like: "Sensor | None" = None) -> "Sensor":
+        """Sensor of another size, geometrically similar to the default one, for a finger tip as well as a table.
+
+        All lengths are multiplied by s = width / (width of the other pad): pad, camera, lights, skin and depths. The
+        stiffness of the gel is multiplied by s^-3. An object s times as large then leaves s times as large an imprint
+        under the same force, and the images are the same.
+
+        Another ratio of height to width than the other pad's stretches the pad, the camera's view and the places of
+        LEDs along y. The gel's grid keeps its number of cells, and their shape, as far as whole numbers allow.
+
+        Args:
+            width: Width of the pad along x (m).
+            height: Height of the pad along y (m). None keeps the ratio.
+            like: Sensor whose constants are scaled. None for the default sensor.
+        """
+        for name, side in (("width", width), ("height", height)):
+            if side is not None and not _SMALLEST <= side <= _WIDEST:
+                raise ValueError(
+                    f"{name} must be from {_SMALLEST:g} to {_WIDEST:g} m, got {side!r}: give the size of the pad in "
+                    "metres, not in millimetres"
+                )
+        like = cls() if like is None else like
+        sensor = _scaled(like, width / float(like.gel.size[0]))
+        if height is None:
+            return sensor
+        stretch = height / float(sensor.gel.size[1])
+        camera, lights, (rows, columns) = sensor.camera, sensor.lights, sensor.gel.cells
+        if isinstance(lights, Leds):
+            lights = dataclasses.replace(lights, positions=lights.positions * jnp.array([1.0, stretch, 1.0]))
+        return dataclasses.replace(
+            sensor,
+            camera=dataclasses.replace(
+                camera,
+                fov=2 * math.atan(math.tan(float(camera.fov) / 2) * stretch),
+                aspect=float(camera.aspect) / stretch,
+            ),
+            gel=dataclasses.replace(
+                sensor.gel,
+                size=(sensor.gel.size[0], height),
+                cells=(max(1, round(rows * stretch**0.5)), max(1, round(columns / stretch**0.5))),
+            ),
+            lights=lights,
+        )
 
     def check(self) -> None:
         """Raise a ValueError that names the field, its value and the limit, if a constant is out of range.
@@ -125,6 +172,16 @@ class Sensor:
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
         return sensor
+
+
+def _scaled(value: Any, scale: float, power: int = 0) -> Any:
+    """Multiply all constants by the scale to the power that their metadata state."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        powers = {f.name: f.metadata.get("metres", 0) for f in dataclasses.fields(value)}
+        return dataclasses.replace(value, **{k: _scaled(getattr(value, k), scale, p) for k, p in powers.items()})
+    if isinstance(value, tuple):
+        return tuple(_scaled(v, scale, power) for v in value)
+    return value * scale**power if power else value
 
 
 def _plain(value: Any) -> Any:

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from damage import damaged
-from optics_bodies import with_field
+from optics_bodies import at, ball, weight, with_field
 
-from sts_jax import Sensor, storage, tactile
+from sts_jax import Sensor, sense, storage, tactile
 
 
 def test_the_defaults_equal_the_papers_values():
@@ -149,3 +149,52 @@ def test_flipped_bits_of_a_saved_sensor_are_found_and_edited_files_are_accepted_
         Sensor.load(path)
     (tmp_path / "manifest.json").write_text("of another program")
     Sensor.load(path)
+
+
+@pytest.mark.parametrize("width", [0.0375, 0.04, 0.6])
+def test_a_similar_body_under_the_same_force_gives_the_same_images_on_a_similar_sensor(width):
+    like = Sensor(lights=tactile.Leds(), skin=tactile.Skin(coupling=0.0007, shadow_steps=4))
+
+    def frame(sensor, scale):
+        body = ball()
+        body = dataclasses.replace(body, vertices=body.vertices * scale, hulls=body.hulls * scale)
+        placement = at(0.012 * scale, -0.02 * scale, 0.0305 * scale, (0.9, 0, 0, 0.4))
+        return sense(sensor, body, placement, weight(1, 0.012 * scale, -0.02 * scale), resolution=(32, 32))
+
+    scale, first = width / 0.15, frame(like, 1)
+    second = frame(Sensor.sized(width, like=like), scale)
+    assert first.balanced
+    assert second.balanced
+    assert float(first.pressure.max()) > 1000
+    assert np.array_equal(first.segmentation, second.segmentation)
+    pairs = {
+        "visual": (first.visual, second.visual),
+        "tactile": (first.tactile, second.tactile),
+        "depth": (first.depth, second.depth / scale),
+        "pressure": (first.pressure / 1e4, second.pressure / 1e4 * scale**2),
+        "position": (first.pose[:3], second.pose[:3] / scale),
+        "window": (first.window, second.window / scale),
+    }
+    exact = width == 0.0375  # a power of two
+    for name, (one, other) in pairs.items():
+        np.testing.assert_allclose(one, other, atol=1e-6 if exact else 1e-4, err_msg=name)
+
+
+def test_a_sensor_of_the_default_size_is_the_default_and_a_stretched_one_shows_its_whole_pad():
+    for one, other in zip(jax.tree.leaves(Sensor()), jax.tree.leaves(Sensor.sized(0.15)), strict=True):
+        assert np.array_equal(one, other)
+    tall = Sensor.sized(0.02, 0.04, like=Sensor(lights=tactile.Leds()))
+    tall.check()
+    assert tall.gel.size == (pytest.approx(0.02), 0.04)
+    assert tall.camera.distance * np.tan(tall.camera.fov / 2) == pytest.approx(0.02)
+    assert tall.camera.aspect == pytest.approx(4 / 3 / 2)
+    assert tall.gel.cells == (212, 106)
+    assert np.allclose(tall.lights.positions[:, :2], [[-0.014, 0], [0.014, 0], [0, -0.028], [0, 0.028]])
+
+
+@pytest.mark.parametrize(
+    ("size", "name"), [((40,), "width"), ((0,), "width"), ((-0.04,), "width"), ((0.04, 30), "height")]
+)
+def test_a_size_that_is_not_positive_or_in_millimetres_raises_an_error(size, name):
+    with pytest.raises(ValueError, match=rf"{name} must be from 0.001 to 1 m, got {size[-1]}: .* in metres, not"):
+        Sensor.sized(*size)

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sts_jax._ranges import POSITIVE
+from sts_jax._ranges import LENGTH, POSITIVE
 
 Scalar = float | Array
 
@@ -23,13 +23,13 @@ class Camera:
     """A pinhole on the sensor's z axis, looking out through the gel along +z."""
 
     # Distance from the pinhole to the gel's outer face (m). Source: paper's code, bottom of the block.
-    distance: Scalar = dataclasses.field(default=0.1, metadata=POSITIVE)
+    distance: Scalar = dataclasses.field(default=0.1, metadata=POSITIVE | LENGTH)
     # Vertical field of view (rad). With the default (paper's code), the pad is as high as the image.
     fov: Scalar = dataclasses.field(default=2 * math.atan(0.75), metadata=POSITIVE | {"below": math.pi})
     # Width / height of the whole view. Source: device, 1640 x 1232 pixels, and paper's code, 640 x 480.
     aspect: Scalar = dataclasses.field(default=4 / 3, metadata=POSITIVE)
     # Smallest depth (m). A face of the object is not drawn if one of its corners is nearer to the pinhole.
-    near: Scalar = dataclasses.field(default=0.02, metadata=POSITIVE)
+    near: Scalar = dataclasses.field(default=0.02, metadata=POSITIVE | LENGTH)
 
 
 def full_window(camera: Camera, resolution: tuple[int, int]) -> Float[Array, "4"]:

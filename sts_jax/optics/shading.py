@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from sts_jax import _cpu_reductions, geometry
-from sts_jax._ranges import NOT_NEGATIVE, POSITIVE, SHARE
+from sts_jax._ranges import LENGTH, NOT_NEGATIVE, POSITIVE, SHARE
 from sts_jax._sampling import bilinear
 
 Scalar = float | Array
@@ -46,7 +46,7 @@ class Room:
         default_factory=lambda: jnp.array([178.0, 178, 204]) / 255, metadata=SHARE
     )
     # Height above the skin at which 1/e of an object's light reaches the camera (m). Haze replaces the rest.
-    haze: Scalar = dataclasses.field(default=3.0, metadata=POSITIVE)
+    haze: Scalar = dataclasses.field(default=3.0, metadata=POSITIVE | LENGTH)
     # Share of the background's light that is scattered by the skin. An object near the skin hides a part of it.
     milk: Scalar = dataclasses.field(default=0.25, metadata=SHARE)
     # Share of an object's light that skin and gel transmit, in each channel. The default is close to the hue of
@@ -55,21 +55,21 @@ class Room:
     # Share of its light that the underside of an object on the skin loses where it hides the whole sky from the skin.
     crease: Scalar = dataclasses.field(default=0.4, metadata=SHARE)
     # Height above the skin at which this loss is 1/e as large (m).
-    crease_height: Scalar = dataclasses.field(default=0.015, metadata=POSITIVE)
+    crease_height: Scalar = dataclasses.field(default=0.015, metadata=POSITIVE | LENGTH)
     # Share of light that is lost at the middle of the pad's edges. The loss grows with the square of the distance from
     # the pad's centre.
     vignette: Scalar = dataclasses.field(default=0.1, metadata=SHARE)
     # Brightness of the housing's walls just below the pad's edge, as an sRGB value relative to the pad's.
     rim: Scalar = dataclasses.field(default=0.3, metadata=NOT_NEGATIVE)
     # Depth below the skin at which the walls are 1/e as bright (m).
-    rim_depth: Scalar = dataclasses.field(default=0.03, metadata=POSITIVE)
+    rim_depth: Scalar = dataclasses.field(default=0.03, metadata=POSITIVE | LENGTH)
     # Exposure time of the visual stream divided by that of the tactile stream. `expose` uses it.
     exposure: Scalar = dataclasses.field(default=1.0, metadata=POSITIVE)
 
 
 _SKY_CELLS = 30  # approximate number of cells along each side of the grid in `hidden_sky`
 _SLICES = 4  # number of slices of an object in `hidden_sky`
-_LOWEST = 0.0015  # m, smallest height of a slice
+_LOWEST = 0.01  # smallest height of a slice, relative to the mean side of the pad
 
 
 def to_linear(srgb: Float[Array, "*n"]) -> Float[Array, "*n"]:
@@ -147,7 +147,8 @@ def hidden_sky(
     rows, columns = covered.shape
     pitch_y, pitch_x = (s / n * b for s, n, b in zip(size[::-1], heights.shape, blocks, strict=True))
 
-    lowest = jnp.clip(_cpu_reductions.minimum(jnp.min(heights, axis=0)), _LOWEST, 1)
+    least = (size[0] + size[1]) * (_LOWEST / 2)
+    lowest = jnp.clip(_cpu_reductions.minimum(jnp.min(heights, axis=0)), least, 1)
     highest = jnp.maximum(top, lowest)
     hidden = jnp.zeros_like(covered)
     for share in (k / (_SLICES - 1) for k in range(_SLICES)):

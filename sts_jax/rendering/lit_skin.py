@@ -8,7 +8,8 @@ from sts_jax import tactile
 from sts_jax.rendering.tiles import planes, where_active
 from sts_jax.sensor import Sensor
 
-_UNTOUCHED = 1e-8  # m, a shallower imprint does not change the image, such as the tail of the smoothing
+# Part of the gel's thickness. A shallower imprint does not change the image, such as the tail of the smoothing.
+_UNTOUCHED = 2e-6
 
 
 def lit_skin(
@@ -31,7 +32,7 @@ def lit_skin(
     untouched = tactile.phong(
         sensor.phong, sensor.lights, jnp.broadcast_to(jnp.array([[[0.0, 0.0, -1.0]]]), flat.shape), flat
     )
-    pressed = _near(imprint > _UNTOUCHED)
+    pressed = _near(imprint > _UNTOUCHED * sensor.gel.thickness)
     return where_active(_skin, pressed, sensor, (*slopes, imprint, *shares), planes(untouched), ring=1)
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, ScalarLike
 
 from sts_jax import _cpu_reductions
-from sts_jax._ranges import POSITIVE, STATIC
+from sts_jax._ranges import LENGTH, POSITIVE, STATIC
 
 _NEWTON_STEPS = 20  # largest number of steps
 _SETTLED = 1e-7  # m, the iteration ends after a step shorter than this
@@ -31,14 +31,14 @@ class Gel:
     """A rectangular pad of soft gel. Its outer face lies in the plane z = 0."""
 
     # Size along x and y (m). Source: paper, "Real-World Dataset".
-    size: tuple[Scalar, Scalar] = dataclasses.field(default=(0.15, 0.15), metadata=POSITIVE)
+    size: tuple[Scalar, Scalar] = dataclasses.field(default=(0.15, 0.15), metadata=POSITIVE | LENGTH)
     # Thickness (m). Source: paper, supplement "Simulator Details".
-    thickness: Scalar = dataclasses.field(default=0.005, metadata=POSITIVE)
+    thickness: Scalar = dataclasses.field(default=0.005, metadata=POSITIVE | LENGTH)
     # Pressure per depth (N/m^3). The default gives 10 kPa at a depth of 5 mm. A bottle then sinks 0.2-0.3 mm. Our
     # choice.
-    stiffness: Scalar = dataclasses.field(default=2e6, metadata=POSITIVE)
+    stiffness: Scalar = dataclasses.field(default=2e6, metadata=POSITIVE | {"metres": -3})
     # Largest depth to which an object with a wrench sinks (m). Our choice.
-    max_depth: Scalar = dataclasses.field(default=0.003, metadata=POSITIVE)
+    max_depth: Scalar = dataclasses.field(default=0.003, metadata=POSITIVE | LENGTH)
     # Largest tilt of an object from its given pose, about x and about y (rad). The default is 5 degrees, our choice. It
     # must be < 0.3, because the equilibrium assumes that the tangent of a tilt is equal to its angle.
     max_tilt: Scalar = dataclasses.field(default=0.0873, metadata=POSITIVE | {"below": 0.3})

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sts_jax import geometry
-from sts_jax._ranges import NOT_NEGATIVE, POSITIVE, STATIC
+from sts_jax._ranges import LENGTH, NOT_NEGATIVE, POSITIVE, STATIC
 from sts_jax._sampling import bilinear, shifted
 
 _NEAREST = 1e-4  # m, smallest distance between a light and a lit point. Smaller ones are replaced by it
@@ -58,7 +58,8 @@ class Leds:
     positions: Float[Array, "*n m 3"] = dataclasses.field(
         default_factory=lambda: jnp.array(
             [[-0.105, 0, -0.003], [0.105, 0, -0.003], [0, -0.105, -0.003], [0, 0.105, -0.003]]
-        )
+        ),
+        metadata=LENGTH,
     )
     # Intensity of each light in the red, green and blue channel at the distance `reference`, for diffuse and specular
     # reflection alike.
@@ -69,7 +70,7 @@ class Leds:
     # Exponent of the decrease of the intensity with distance: 2 for a point, 1 for a long strip, 0 for no decrease.
     falloff: Scalar = dataclasses.field(default=1.0, metadata=NOT_NEGATIVE)
     # Distance at which a light has the intensity `colors` (m).
-    reference: Scalar = dataclasses.field(default=0.08, metadata=POSITIVE)
+    reference: Scalar = dataclasses.field(default=0.08, metadata=POSITIVE | LENGTH)
 
 
 @jax.tree_util.register_dataclass
@@ -78,12 +79,12 @@ class Skin:
     """Smoothing of an imprint, and the shadows that the skin casts on itself."""
 
     # Standard deviation of the Gaussian that smooths the imprint (m). The default is 0, as in the paper.
-    coupling: Scalar = dataclasses.field(default=0.0, metadata=NOT_NEGATIVE)
+    coupling: Scalar = dataclasses.field(default=0.0, metadata=NOT_NEGATIVE | LENGTH)
     # Number of points on the way to each light at which the skin may hide it. The default is 0, no shadows, as in the
     # paper.
     shadow_steps: int = dataclasses.field(default=0, metadata=NOT_NEGATIVE | {"at_most": 1000} | STATIC)
     # Length of the longest shadow along the gel's face (m). Our choice.
-    shadow_reach: Scalar = dataclasses.field(default=0.02, metadata=POSITIVE)
+    shadow_reach: Scalar = dataclasses.field(default=0.02, metadata=POSITIVE | LENGTH)
     # Angular height of a light, seen from the skin (rad). A point is in partial shadow if only a part of this height is
     # visible from it. Our choice.
     penumbra: Scalar = dataclasses.field(default=0.1, metadata=POSITIVE)
@@ -106,7 +107,7 @@ class Phong:
     )
     # Depth of the imprint at which the skin is 1/e as bright (m). The paper has a darkening mask, but does not give its
     # shape.
-    darkening: Scalar = dataclasses.field(default=0.001, metadata=POSITIVE)
+    darkening: Scalar = dataclasses.field(default=0.001, metadata=POSITIVE | LENGTH)
 
 
 def couple(depth: Float[Array, "h w"], length: Scalar, pitch: Float[Array, "2"]) -> Float[Array, "h w"]:
