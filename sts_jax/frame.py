@@ -2,18 +2,21 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Real
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, Real
 
 from sts_jax import optics
 from sts_jax._checked import checked, in_32_bits, warn
 from sts_jax._plausible import placement_problem
 from sts_jax._ranges import MOST_PIXELS
 from sts_jax.objects.body import FACE_CLASSES, Body, is_traced
+from sts_jax.optics import Camera
 from sts_jax.rendering import drawing, equilibrium
+from sts_jax.rendering.group import draw_group, group
 from sts_jax.sensor import Sensor
 
 
@@ -31,14 +34,15 @@ class Frame:
     depth: Float[Array, "*n h w"]
     segmentation: Bool[Array, "*n h w"]  # Pixels of the object: True where `depth` is finite.
     # Pose that is drawn, after the object has sunk into the gel: mesh frame in the sensor frame, position (m) and
-    # quaternion.
-    pose: Float[Array, "*n 7"]
+    # quaternion. With b bodies (*n, b, 7).
+    pose: Float[Array, "*k 7"]
     # True if the gel balances the wrench within its limits of depth and tilt, or if no wrench presses on it. False for
-    # an invalid sensor, or a pose, wrench or body with values that are not finite.
-    balanced: Bool[Array, "*n"]
+    # an invalid sensor, or a pose, wrench or body with values that are not finite. With b bodies (*n, b).
+    balanced: Bool[Array, "*k"]
     # Pressure on the cells of the gel's grid (Pa). `tactile.cell_centres` returns the centres of the cells.
     pressure: Float[Array, "*n r c"]
     window: Float[Array, "*n 4"]  # Part of the gel's outer face that the images show: left, top, width, height (m).
+    body: Int[Array, "*n h w"]  # Index of the body that each pixel shows, -1 where there is none.
 
     def __repr__(self) -> str:
         if not hasattr(self.depth, "shape") or len(self.depth.shape) < 2:  # JAX also builds trees of other leaves
@@ -51,7 +55,7 @@ class Frame:
         pressed = "nothing presses on the gel"
         if np.any(self.pressure > 0):
             pressed = f"pressure up to {np.max(self.pressure) / 1e3:.3g} kPa"
-        balance = "balanced" if self.balanced else "not balanced"
+        balance = "balanced" if np.all(self.balanced) else "not balanced"
         return f"Frame({size}, object in {seen:.1%} of the view, {pressed}, {balance})"
 
 
@@ -60,18 +64,23 @@ class Frame:
 def sense(
     sensor: Sensor,
     body: Body | list[Body] | tuple[Body, ...],
-    pose: Float[ArrayLike, "7"] | tuple,
-    wrench: Float[ArrayLike, "6"] | None = None,
+    pose: Float[ArrayLike, "7"] | Float[ArrayLike, "b 7"] | tuple,
+    wrench: Float[ArrayLike, "6"] | Float[ArrayLike, "b 6"] | None = None,
     *,
     resolution: tuple[int, int] = (64, 64),
     crop: bool = False,
     moving_edges: bool = False,
 ) -> Frame:
-    """Render the images that the sensor takes of one object. Works under `jit`, `vmap` and `grad`.
+    """Render the images that the sensor takes of one object, or of several. Works under `jit`, `vmap` and `grad`.
 
     With a wrench, the object sinks and tilts until the gel balances Fz, Mx and My (`tactile.settle`). Without one, it
     stays in the given pose. An object that is wholly inside the sensor (z < 0) is not drawn: z = -1 m gives images of
     the empty sensor.
+
+    Several bodies are a list of any bodies, such as an object, the opposite finger and a table. The nearest surface of
+    all is drawn. Each body sinks and tilts under its own wrench. With Fz <= 0 it stays in its pose and leaves no
+    imprint. Large faces, such as those of a floor, are clipped at `Camera.near`. Bodies that `jit` traces are not
+    clipped, and their padding is drawn too, so close over them.
 
     The images also show an empty sensor, and `Frame.balanced` is False, if the pose or the wrench is not finite, the
     quaternion's squared length is zero or infinite in float32, or a traced sensor or body has invalid values. An
@@ -80,57 +89,87 @@ def sense(
     a load far beyond what the pad bears.
 
     Args:
-        body: One body. For several bodies use `objects.stack` and `jax.vmap`.
-        pose: Mesh frame in the sensor frame: position (m) and quaternion [w, x, y, z].
-        wrench: Wrench of the pad on the object in the sensor frame: force (N) and moment about the origin (N m).
+        body: One body, or a list of b bodies. For one body in each of several frames use `objects.stack` and
+            `jax.vmap`.
+        pose: Mesh frame in the sensor frame: position (m) and quaternion [w, x, y, z]. For several bodies (b, 7).
+        wrench: Wrench of the pad on the object in the sensor frame: force (N) and moment about the origin (N m). For
+            several bodies (b, 6).
         resolution: Height and width of the images (pixels). With another aspect ratio than the camera's, the images
             show the largest centred part of the view.
         crop: True to show only a window around the object, with the aspect ratio of `resolution`.
         moving_edges: True to include the motion of the imprint's edges in the derivative of the tactile image with
             respect to the pose. It serves to fit poses, and is accurate on average over a few pixels.
     """
-    if isinstance(body, list | tuple):
-        raise TypeError(f"body is a {type(body).__name__}: for several bodies use objects.stack and jax.vmap")
     if isinstance(pose, tuple):
         raise TypeError(f"pose is a {type(pose).__name__}: unpack it with *, as in sense(sensor, body, *placement)")
     if not all(1 <= side <= MOST_PIXELS for side in resolution):
         raise ValueError(f"resolution (height, width) must be from 1 to {MOST_PIXELS:,} pixels, got {resolution}")
-    if body.vertices.ndim != 2 or not is_traced(body):
-        body.check()
-    if len(body.faces) > FACE_CLASSES[-1]:
-        raise ValueError(
-            f"body has {len(body.faces):,} faces, but at most {FACE_CLASSES[-1]:,} can be drawn: decimate the mesh "
-            f"with objects.load(path, faces={FACE_CLASSES[-1]})"
-        )
+    bodies = [body] if isinstance(body, Body) else list(body)
+    _check_bodies(bodies)
+    _check_shapes(None if isinstance(body, Body) else len(bodies), pose, wrench)
     placed = sensor, body, pose, wrench  # as given, with the hulls
     pose = jnp.asarray(pose, float)
     wrench = None if wrench is None else jnp.asarray(wrench, float)
+    camera = sensor.camera
     sensor, sound = sensor.guard()
     sound = jnp.asarray(sound)
-    if is_traced(body):
-        for values in (body.vertices, body.normals, body.colors):
+    for each in filter(is_traced, bodies):
+        for values in (each.vertices, each.normals, each.colors):
             sound &= jnp.all(jnp.isfinite(values))
-    # Hulls and interior are not drawn. Without them, bodies of one size class share a program.
-    body = dataclasses.replace(body, hulls=jnp.zeros((1, 1, 3)), interior=jnp.zeros((1, 3, 3)))
-    # Two programs, so that a new resolution compiles only the second one.
-    resting = equilibrium.balance(sensor.gel, sound, body.vertices, body.faces, body.two_sided, pose, wrench)
-    images = drawing.draw(sensor, body, resting, resolution=resolution, crop=crop, moving_edges=moving_edges)
+    if isinstance(body, Body):
+        # Hulls and interior are not drawn. Without them, bodies of one size class share a program.
+        body = dataclasses.replace(body, hulls=jnp.zeros((1, 1, 3)), interior=jnp.zeros((1, 3, 3)))
+        # Two programs, so that a new resolution compiles only the second one.
+        resting = equilibrium.balance(sensor.gel, sound, body.vertices, body.faces, body.two_sided, pose, wrench)
+        images = drawing.draw(sensor, body, resting, resolution=resolution, crop=crop, moving_edges=moving_edges)
+        drawn = images._asdict() | {"pose": resting.shown, "balanced": resting.balanced, "pressure": resting.pressure}
+    else:
+        # A face that reaches from before `near` into the view beyond the gel has a longer edge.
+        camera = Camera() if is_traced(camera) else camera
+        longest = (float(camera.distance) - float(camera.near)) / 2
+        together = group(bodies, longest)
+        drawn = draw_group(
+            sensor,
+            together,
+            pose,
+            wrench,
+            resolution=resolution,
+            crop=crop,
+            moving_edges=moving_edges,
+            sound=sound,
+        )._asdict()
     if not is_traced(placed) and (problem := _problem(*placed, resolution)):  # JAX draws meanwhile
         warn(problem)
-    return Frame(
-        visual=images.visual,
-        tactile=images.tactile,
-        depth=images.depth,
-        segmentation=images.segmentation,
-        pose=resting.shown,
-        balanced=resting.balanced,
-        pressure=resting.pressure,
-        window=images.window,
-    )
+    return Frame(**drawn)
+
+
+def _check_bodies(bodies: list[Body]) -> None:
+    if not bodies:
+        raise ValueError("body is an empty list, but it must have at least one body")
+    for body in bodies:
+        if body.vertices.ndim != 2 or not is_traced(body):
+            body.check()
+    number = sum(len(body.faces) for body in bodies)
+    if len(bodies) > 1 and number > FACE_CLASSES[-1]:
+        number = sum(len(b.faces) if is_traced(b) else int(np.asarray(b.faces).any(axis=1).sum()) for b in bodies)
+    if number > FACE_CLASSES[-1]:
+        raise ValueError(
+            f"body has {number:,} faces, but at most {FACE_CLASSES[-1]:,} can be drawn: decimate the mesh "
+            f"with objects.load(path, faces={FACE_CLASSES[-1]})"
+        )
+
+
+def _check_shapes(number: int | None, pose: ArrayLike, wrench: ArrayLike | None) -> None:
+    """Raise a TypeError unless there is one pose and wrench for one body (None), or for each of several."""
+    for name, value, width in (("pose", pose, 7), ("wrench", wrench, 6)):
+        shape = (width,) if number is None else (number, width)
+        if value is not None and np.shape(value) != shape:
+            whose = "one body" if number is None else f"a list of {number}"
+            raise TypeError(f"parameter '{name}' has the shape {np.shape(value)}, but for {whose} it must be {shape}")
 
 
 def _problem(
-    sensor: Sensor, body: Body, pose: ArrayLike, wrench: ArrayLike | None, resolution: tuple[int, int]
+    sensor: Sensor, body: Body | Sequence[Body], pose: ArrayLike, wrench: ArrayLike | None, resolution: tuple[int, int]
 ) -> str | None:
     """What is probably wrong with a placement. Values that an accelerator still computes are not waited for."""
     for value in (pose, wrench):
@@ -139,14 +178,15 @@ def _problem(
     camera, gel = sensor.camera, sensor.gel
     high = float(camera.distance) * math.tan(float(camera.fov) / 2)
     wide = high * min(float(camera.aspect), resolution[1] / resolution[0])
-    return placement_problem(
-        np.asarray(pose, np.float64),
-        None if wrench is None else np.asarray(wrench, np.float64),
-        np.asarray(body.hulls).reshape(-1, 3),
-        np.array([wide, wide * resolution[0] / resolution[1]]),
-        float(camera.distance),
-        gel,
-    )
+    view = np.array([wide, wide * resolution[0] / resolution[1]])
+    bodies = [body] if isinstance(body, Body) else body
+    poses = np.asarray(pose, np.float64).reshape(-1, 7)
+    wrenches = [None] * len(poses) if wrench is None else np.asarray(wrench, np.float64).reshape(-1, 6)
+    for index, (each, at, load) in enumerate(zip(bodies, poses, wrenches, strict=True)):
+        points = np.asarray(each.hulls).reshape(-1, 3)
+        if problem := placement_problem(at, load, points, view, float(camera.distance), gel):
+            return problem if isinstance(body, Body) else f"body {index}: {problem}"
+    return None
 
 
 @in_32_bits

@@ -45,6 +45,7 @@ def noise(shape, seed=0):
         balanced=jnp.ones(lead, bool),
         pressure=jnp.asarray(rng.uniform(0, 2000, (*lead, 5, 5)), jnp.float32),
         window=jnp.broadcast_to(jnp.array([-0.1, -0.1, 0.2, 0.2]), (*lead, 4)),
+        body=jnp.where(seen, 0, -1),
     )
 
 

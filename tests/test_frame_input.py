@@ -38,7 +38,7 @@ BAD_CALLS = [
         TypeError,
         r"is a Placement: unpack it .*\*",
     ),
-    (lambda: sense(SENSOR, [BODY, BODY], POSE), TypeError, r"body is a list: .* objects\.stack and jax\.vmap"),
+    (lambda: sense(SENSOR, [BODY, BODY], POSE), TypeError, r"'pose' has the shape \(7,\), .* \(2, 7\)"),
     (lambda: sense(SENSOR, objects.stack([BODY, BODY]), POSE), ValueError, r"\(v, 3\): use jax\.vmap for"),
     (lambda: sense(SENSOR, too_many_faces(), POSE), ValueError, "131,073 faces, but at most 131,072 .*faces=131072"),
     (lambda: touch(SENSOR, jnp.zeros((4, 5, 3))), TypeError, "parameter 'imprint'"),

@@ -72,7 +72,7 @@ def test_a_frame_without_imperfections_equals_expose(exposure, leakage):
     sensor = dataclasses.replace(sensor, room=dataclasses.replace(sensor.room, exposure=exposure))
     rng, empty = np.random.default_rng(0), jnp.zeros((32, 48))
     visual, tactile = (jnp.asarray(rng.random((32, 48, 3)) ** 2, jnp.float32) for _ in range(2))
-    pose = jnp.zeros(7), jnp.asarray(True), jnp.zeros((4, 4)), jnp.zeros(4)
+    pose = jnp.zeros(7), jnp.asarray(True), jnp.zeros((4, 4)), jnp.zeros(4), jnp.full((32, 48), -1)
     frame = sts.Frame(visual, tactile, empty, empty > 0, *pose)
     blender = twin.Blender(dataclasses.replace(PERFECT, leakage=leakage), sensor=sensor)
     ends = blender.ends(np.asarray(visual), np.asarray(tactile))

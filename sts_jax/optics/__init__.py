@@ -7,9 +7,11 @@ from sts_jax.optics.camera import rays as rays
 from sts_jax.optics.camera import to_pixels as to_pixels
 from sts_jax.optics.external_view import photograph as photograph
 from sts_jax.optics.shading import Room as Room
+from sts_jax.optics.shading import Texels as Texels
 from sts_jax.optics.shading import empty_view as empty_view
 from sts_jax.optics.shading import hidden_sky as hidden_sky
 from sts_jax.optics.shading import housing as housing
+from sts_jax.optics.shading import sample_texels as sample_texels
 from sts_jax.optics.shading import sample_texture as sample_texture
 from sts_jax.optics.shading import shade as shade
 from sts_jax.optics.shading import to_linear as to_linear

@@ -6,10 +6,11 @@ Light is linear RGB, unless stated otherwise. As the last step of rendering, `to
 import dataclasses
 import functools
 import operator
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from sts_jax import _cpu_reductions, geometry
 from sts_jax._ranges import LENGTH, NOT_NEGATIVE, POSITIVE, SHARE
@@ -94,6 +95,29 @@ def sample_texture(texture: Float[Array, "t t 3"], uv: Float[Array, "*n 2"]) -> 
         return jnp.broadcast_to(texture[0], (*uv.shape[:-1], 3))
     place = uv * size - 0.5
     return bilinear(texture, place[..., 0], place[..., 1], wrap=True)
+
+
+class Texels(NamedTuple):
+    """Square textures of n bodies in one list of texels, row by row."""
+
+    colors: Float[Array, "t 3"]  # linear light, [0, 1]
+    first: Int[Array, "n"]  # place of the first texel of each texture
+    side: Int[Array, "n"]  # number of rows of each texture
+
+
+def sample_texels(texels: Texels, of: Int[Array, "*n"], uv: Float[Array, "*n 2"]) -> Float[Array, "*n 3"]:
+    """`sample_texture` with the texture `of` for each point."""
+    first, side = texels.first[of], texels.side[of]
+    if texels.colors.shape[0] == texels.first.shape[0]:  # one texel for each
+        return texels.colors[of]
+    place = uv * side[..., None] - 0.5
+    before = jnp.floor(place)
+    x, y = (share[..., None] for share in jnp.moveaxis(place - before, -1, 0))
+    left, top = jnp.moveaxis(before.astype(jnp.int32) % side[..., None], -1, 0)
+    right, bottom = (left + 1) % side, (top + 1) % side
+    upper = texels.colors[first + top * side + left] * (1 - x) + texels.colors[first + top * side + right] * x
+    lower = texels.colors[first + bottom * side + left] * (1 - x) + texels.colors[first + bottom * side + right] * x
+    return upper * (1 - y) + lower * y
 
 
 def hidden_sky(

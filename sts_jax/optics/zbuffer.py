@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float, Int, ScalarLike, UInt32
 from sts_jax import _cpu_reductions
 
 _SLACK = 1e-4  # pixels by which faces are enlarged, so that no pixel centre on a shared edge is missed
+_ROUNDING = 1e-6, 0.25  # the same for vertices far beyond the image: share of the largest coordinate, and at most this
 _GROUP = 1024  # number of faces that are cut into runs at a time
 _RUN = 8  # largest number of pixels in a run
 _NOTHING = np.uint32(0xFFFFFFFF)  # key of a pixel without a face
@@ -38,7 +39,8 @@ class _Screen(NamedTuple):
     order: Float[Array, "v"]  # orders of the vertices
     keep: Bool[Array, "v"]  # True for vertices whose faces can be drawn
     faces: Int[Array, "f 3"]  # vertex indices
-    two_sided: Bool[Array, ""]  # True if faces are also visible from behind
+    two_sided: Bool[Array, "*f"]  # True if faces, or each face, are also visible from behind
+    slack: ScalarLike  # pixels by which faces are enlarged
 
     def corners(self, chosen: Int[Array, "n"]) -> tuple[_Corner, _Corner, _Corner]:
         a, b, c = ((self.column[k], self.row[k], self.order[k]) for k in self.faces[chosen].T)
@@ -81,10 +83,11 @@ def rasterise(
     order: Float[Array, "v"],
     faces: Int[Array, "f 3"],
     keep: Bool[Array, "v"],
-    two_sided: Bool[Array, ""],
+    two_sided: Bool[Array, "*f"],
     shape: tuple[int, int],
     *,
     within: ScalarLike | None = None,
+    distant: bool = False,
     chunk: int = 1024,
 ) -> Int[Array, "*layers h w"]:
     """Find the nearest face at every pixel centre.
@@ -95,9 +98,11 @@ def rasterise(
         faces: Vertex indices, counter-clockwise as seen from outside the object in a right-handed frame. Padding faces,
             with three equal corners, cost almost nothing.
         keep: Mask of the vertices. A face is drawn only if the mask is True for all its corners.
-        two_sided: If True, faces are also visible from behind.
+        two_sided: If True, faces are also visible from behind. One flag, or one for each face.
         shape: Height and width of the image (pixels).
         within: Limit in units of `order`, or None. A face is near if one of its corners has a smaller order.
+        distant: If True, vertices may lie so far beyond the image that rounding of their coordinates would leave cracks
+            between faces. Faces are then enlarged by this rounding.
         chunk: Number of runs that are drawn at a time.
 
     Returns:
@@ -105,7 +110,11 @@ def rasterise(
         image of only the near faces, then the image of all faces.
     """
     points, order, within = jax.lax.stop_gradient((points, order, within))
-    screen = _Screen(points[:, 0], points[:, 1], order, keep, faces, two_sided)
+    slack: ScalarLike = _SLACK
+    if distant:
+        most = _cpu_reductions.maximum(jnp.where(keep, jnp.max(jnp.abs(points), axis=1), 0))
+        slack = jnp.clip(_ROUNDING[0] * most, _SLACK, _ROUNDING[1])
+    screen = _Screen(points[:, 0], points[:, 1], order, keep, faces, two_sided, slack)
     image = _draw(screen, _list_runs(screen, shape, chunk), shape, within, chunk)
     if within is not None:
         near, far = image.reshape(2, math.prod(shape))
@@ -157,20 +166,22 @@ def _count_runs(
     Faces before `first_face` are part of an earlier group and are not drawn again.
     """
     height, width = shape
+    slack = screen.slack
+    two_sided = screen.two_sided if screen.two_sided.ndim == 0 else screen.two_sided[face]
     a, b, c = screen.corners(face)
     area = _cross(a, b, c)
     # Seen along +z with x right and y down, a face towards the camera is counter-clockwise: negative area.
-    drawn = jnp.where(screen.two_sided, area != 0, area < 0) & jnp.all(screen.keep[screen.faces[face]], axis=1)
+    drawn = jnp.where(two_sided, area != 0, area < 0) & jnp.all(screen.keep[screen.faces[face]], axis=1)
     left, right = _lowest(a[0], b[0], c[0]), _highest(a[0], b[0], c[0])
     top, bottom = _lowest(a[1], b[1], c[1]), _highest(a[1], b[1], c[1])
     tall = bottom - top
     widest = jnp.abs(area) / jnp.where(tall > 0, tall, 1)
     # The rows of a face that is nearly a horizontal line on the screen are as wide as the face.
     widest = jnp.where(tall > 1e-3, jnp.minimum(widest, right - left), right - left)
-    outside = (jnp.ceil(left - _SLACK) > width - 1) | (jnp.floor(right + _SLACK) < 0)
-    empty = jnp.ceil(left - _SLACK) > jnp.floor(right + _SLACK)
-    columns = jnp.clip(jnp.floor(widest + 2 * _SLACK) + 1, 0, width)
-    rows = jnp.clip(jnp.floor(bottom + _SLACK), -1, height - 1) - _first_row(top, height) + 1
+    outside = (jnp.ceil(left - slack) > width - 1) | (jnp.floor(right + slack) < 0)
+    empty = jnp.ceil(left - slack) > jnp.floor(right + slack)
+    columns = jnp.clip(jnp.floor(widest + 2 * slack) + 1, 0, width)
+    rows = jnp.clip(jnp.floor(bottom + slack), -1, height - 1) - _first_row(top, height, slack) + 1
     drawn &= (face >= first_face) & ~outside & ~empty & (rows > 0)
     per_row = jnp.ceil(columns / _RUN)
     number = jnp.where(drawn, rows * per_row, 0).astype(jnp.int32)
@@ -223,10 +234,10 @@ def _spans(
     slope_x = ((o1 - o0) * (y2 - y0) - (o2 - o0) * (y1 - y0)) / safe_area
     slope_y = ((o2 - o0) * (x1 - x0) - (o1 - o0) * (x2 - x0)) / safe_area
     line = jnp.floor((run - begin + 0.5) / per_row)  # exact, for whole numbers below 2^22
-    row = _first_row(_lowest(y0, y1, y2), height) + line
+    row = _first_row(_lowest(y0, y1, y2), height, screen.slack) + line
     start, stop = _row_ends(corners, area, row)
-    column = jnp.maximum(jnp.ceil(start - _SLACK), 0) + _RUN * (run - begin - line * per_row)
-    length = jnp.clip(jnp.minimum(jnp.floor(stop + _SLACK), width - 1) - column + 1, 0, _RUN)
+    column = jnp.maximum(jnp.ceil(start - screen.slack), 0) + _RUN * (run - begin - line * per_row)
+    length = jnp.clip(jnp.minimum(jnp.floor(stop + screen.slack), width - 1) - column + 1, 0, _RUN)
     length = jnp.where(run < runs.total, length, 0).astype(jnp.int32)
     value = o0 + slope_x * (column - x0) + slope_y * (row - y0)
     least, most = _lowest(o0, o1, o2), _highest(o0, o1, o2)
@@ -294,8 +305,8 @@ def _cross(a: tuple[Array, ...], b: tuple[Array, ...], c: tuple[Array, ...]) -> 
     return (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1])
 
 
-def _first_row(top: Array, height: int) -> Array:
-    return jnp.clip(jnp.ceil(top - _SLACK), 0, height)
+def _first_row(top: Array, height: int, slack: ScalarLike) -> Array:
+    return jnp.clip(jnp.ceil(top - slack), 0, height)
 
 
 def _lowest(a: Array, b: Array, c: Array) -> Array:

@@ -18,6 +18,8 @@ from sts_jax.rendering.loop import looped
 from sts_jax.rendering.tiles import lines, planes, where_active
 from sts_jax.sensor import Sensor
 
+_SKY_TOP = 2.0  # height above the gel, relative to the pad's longer side, above which several objects hide no sky
+
 
 class Images(NamedTuple):
     """Images of one moment, and the part of the gel that they show."""
@@ -26,7 +28,20 @@ class Images(NamedTuple):
     tactile: Float[Array, "h w 3"]  # image of the lit skin in [0, 1]
     depth: Float[Array, "h w"]  # depth from the pinhole (m), `inf` where there is no object
     segmentation: Bool[Array, "h w"]  # pixels of the object
+    body: Int[Array, "h w"]  # index of the object that is seen, -1 where there is none
     window: Float[Array, "4"]  # part of the gel's face in the images: left, top, width, height (m)
+
+
+class Surface(NamedTuple):
+    """Faces to draw, of one object, or of n objects whose vertices are in one list."""
+
+    faces: Int[Array, "f 3"]  # vertex indices
+    normals: Float[Array, "f 3 3"]  # normals at the corners of each face, mesh frame
+    colors: Float[Array, "f 3 3"]  # linear RGB colours at the corners of each face
+    uv: Float[Array, "f 3 2"]  # texture coordinates at the corners of each face
+    texture: Float[Array, "t t 3"] | optics.Texels  # texture, or those of n objects, multiplied by the colours
+    two_sided: Bool[Array, "*f"]  # True if faces, or each face, are also visible from behind
+    owner: Int[Array, "f"] | None = None  # object of each face, None for one object
 
 
 class _Samples(NamedTuple):
@@ -42,17 +57,13 @@ class _Samples(NamedTuple):
     winner: Int[Array, "a b"]  # index of the nearest face, -1 where there is none
 
 
-class _Surface(NamedTuple):
-    """Constants of the sensor and the object's surface, for shading."""
+class _Scene(NamedTuple):
+    """Constants of the sensor and the faces, for shading."""
 
     sensor: Sensor
     corners: Corners  # vertices on the grid of samples
-    turn: Float[Array, "3 3"]  # rotation matrix from the mesh frame to the sensor frame
-    normals: Float[Array, "f 3 3"]  # normals at the corners of each face, mesh frame
-    colors: Float[Array, "f 3 3"]  # linear RGB colours at the corners of each face
-    uv: Float[Array, "f 3 2"]  # texture coordinates at the corners of each face
-    texture: Float[Array, "t t 3"]  # texture, which is multiplied by the colours
-    two_sided: Bool[Array, ""]  # True if faces are also visible from behind
+    turn: Float[Array, "*n 3 3"]  # rotation matrix from the mesh frame to the sensor frame
+    surface: Surface
 
 
 @functools.partial(jax.jit, static_argnames=("resolution", "crop", "moving_edges"))
@@ -60,7 +71,11 @@ def draw(
     sensor: Sensor, body: Body, resting: Resting, *, resolution: tuple[int, int], crop: bool, moving_edges: bool
 ) -> Images:
     """Draw the images of an object in the pose that `rendering.equilibrium` found. See `sense`."""
-    drawn = functools.partial(_draw, resolution=resolution, crop=crop, moving_edges=moving_edges)
+
+    def drawn(sensor: Sensor, body: Body, resting: Resting) -> Images:
+        surface = Surface(body.faces, body.normals, body.colors, body.uv, body.texture, body.two_sided)
+        return images_of(sensor, surface, resting, resolution=resolution, crop=crop, moving_edges=moving_edges)
+
     return looped(drawn)(sensor, body, resting)
 
 
@@ -78,8 +93,8 @@ def touch(sensor: Sensor, imprint: Float[Array, "h w"], window: Float[Array, "4"
     return jnp.stack([jnp.clip(channel * walls, 0, 1) for channel in lit], axis=-1)
 
 
-def _draw(
-    sensor: Sensor, body: Body, resting: Resting, *, resolution: tuple[int, int], crop: bool, moving_edges: bool
+def images_of(
+    sensor: Sensor, surface: Surface, resting: Resting, *, resolution: tuple[int, int], crop: bool, moving_edges: bool
 ) -> Images:
     """Draw one item: sample, shade, light, and filter to pixels."""
     if crop:
@@ -90,28 +105,37 @@ def _draw(
     # Large images have one sample per pixel. In small ones, every second sample is a pixel centre, and the others lie
     # half-way between.
     stride = 2 if min(resolution) < sensor.fine_below else 1
-    samples = _sample(sensor, body, resting, window, resolution, stride)
-    depth, light = _see(sensor, body, resting, samples)
+    samples = _sample(sensor, surface, resting, window, resolution, stride)
+    depth, light = _see(sensor, surface, resting, samples)
     visual = _pixels([channel[1:-1, 1:-1] for channel in light], stride)
     visual = [jnp.clip(optics.to_srgb(channel), 0, 1) for channel in visual]
-    imprint = _imprint(sensor, resting, samples, depth, moving_edges)
+    owner = jnp.zeros((), jnp.int32) if surface.owner is None else surface.owner[jnp.maximum(samples.winner, 0)]
+    pressing = resting.pressing if surface.owner is None else resting.pressing[owner]
+    imprint = _imprint(sensor, pressing, samples, depth, moving_edges)
     lit = lit_skin(sensor, imprint, samples.seen, samples.pitch, samples.slopes)
     lit = _pixels([channel * samples.walls[1:-1, 1:-1] for channel in lit], stride)
     lit = [jnp.clip(channel, 0, 1) for channel in lit]
-    depth = depth[1:-1, 1:-1] if stride == 1 else depth[2:-1:2, 2:-1:2]
+    body = jnp.where(samples.winner >= 0, owner, -1)
+    depth, body = (image[1:-1, 1:-1] if stride == 1 else image[2:-1:2, 2:-1:2] for image in (depth, body))
     return Images(
         visual=jnp.stack(visual, axis=-1),
         tactile=jnp.stack(lit, axis=-1),
         depth=depth,
         segmentation=jnp.isfinite(depth),
+        body=body,
         window=window,
     )
 
 
 def _sample(
-    sensor: Sensor, body: Body, resting: Resting, window: Float[Array, "4"], resolution: tuple[int, int], stride: int
+    sensor: Sensor,
+    surface: Surface,
+    resting: Resting,
+    window: Float[Array, "4"],
+    resolution: tuple[int, int],
+    stride: int,
 ) -> _Samples:
-    """Project and rasterise the object on a grid with `stride` samples per pixel in each direction.
+    """Project and rasterise the faces on a grid with `stride` samples per pixel in each direction.
 
     The grid extends beyond the image by the samples that the filter needs, and by one more ring for the normals.
     """
@@ -123,43 +147,43 @@ def _sample(
     pixels, far = optics.to_pixels(camera, seen, shape, resting.points)
     inverse = 1 / jnp.maximum(far, camera.near)
     keep = resting.present & (far > camera.near)
-    winner = optics.rasterise(pixels, -inverse, body.faces, keep, body.two_sided, shape)
+    distant = surface.owner is not None
+    winner = optics.rasterise(pixels, -inverse, surface.faces, keep, surface.two_sided, shape, distant=distant)
     slopes = lines(optics.rays(camera, seen, shape))
     x, y = (slope * camera.distance for slope in slopes)
     on_pad, walls = _pad_and_walls(sensor, x, y)
-    corners = Corners(pixels[:, 0], pixels[:, 1], inverse, body.faces)
+    corners = Corners(pixels[:, 0], pixels[:, 1], inverse, surface.faces)
     return _Samples(seen, pitch, slopes, (x, y), on_pad, walls, corners, winner)
 
 
 def _see(
-    sensor: Sensor, body: Body, resting: Resting, samples: _Samples
+    sensor: Sensor, surface: Surface, resting: Resting, samples: _Samples
 ) -> tuple[Float[Array, "a b"], list[Float[Array, "a b"]]]:
     """Depth (m), and the three channels of the view through the skin in linear light."""
     size, winner, (x, y) = sensor.gel.size, samples.winner, samples.places
-    hidden = optics.hidden_sky(resting.heights, size, _cpu_reductions.maximum(resting.points[:, 2]), x[0], y[:, 0])
+    top = _cpu_reductions.maximum(resting.points[:, 2])
+    if surface.owner is not None:  # walls beside the pad would spread the slices over their height
+        top = jnp.minimum(top, _SKY_TOP * jnp.maximum(*size))
+    hidden = optics.hidden_sky(resting.heights, size, top, x[0], y[:, 0])
     square_radius = (x * 2 / size[0]) ** 2 + (y * 2 / size[1]) ** 2
     empty = planes(optics.empty_view(sensor.room, square_radius, samples.walls, hidden))
-    surface = _Surface(
-        sensor=sensor,
-        corners=samples.corners,
-        turn=geometry.quat_to_matrix(resting.pose[3:]),
-        normals=body.normals,
-        colors=body.colors,
-        uv=body.uv,
-        texture=body.texture,
-        two_sided=body.two_sided,
-    )
+    scene = _Scene(sensor, samples.corners, geometry.quat_to_matrix(resting.pose[..., 3:]), surface)
     centres = lines(optics.pixel_centres(winner.shape))
     images = (winner, samples.on_pad, *centres, *samples.slopes, hidden, *empty)
-    depth, *light = where_active(_shade, winner >= 0, surface, images, [jnp.full(winner.shape, jnp.inf), *empty])
+    depth, *light = where_active(_shade, winner >= 0, scene, images, [jnp.full(winner.shape, jnp.inf), *empty])
     return depth, light
 
 
-def _shade(surface: _Surface, images: tuple[Array, ...]) -> list[Float[Array, "h w"]]:
+def _shade(scene: _Scene, images: tuple[Array, ...]) -> list[Float[Array, "h w"]]:
     """Depth of the object (m), and the three channels of its colour through the skin in linear light."""
     winner, on_pad, column, row, slope_x, slope_y, hidden, *empty = images
     nearest = jnp.maximum(winner, 0)
-    shares = weighted(surface.corners, winner, column, row)
+    surface, turn = scene.surface, scene.turn
+    two_sided = surface.two_sided
+    if surface.owner is not None:
+        owner = surface.owner[nearest]
+        turn, two_sided = jnp.moveaxis(turn[owner], (-2, -1), (0, 1)), two_sided[nearest]
+    shares = weighted(scene.corners, winner, column, row)
     depth = 1 / functools.reduce(operator.add, shares)
     shares = [share * depth for share in shares]
 
@@ -172,24 +196,28 @@ def _shade(surface: _Surface, images: tuple[Array, ...]) -> list[Float[Array, "h
     # Component by component, because arithmetic along an axis of three is slow on a CPU. Components are stacked only
     # for functions of vectors.
     across = inside(surface.normals)
-    nx, ny, nz = (row[0] * across[0] + row[1] * across[1] + row[2] * across[2] for row in surface.turn)
+    nx, ny, nz = (row[0] * across[0] + row[1] * across[1] + row[2] * across[2] for row in turn)
     square = nx * nx + ny * ny + nz * nz
     scale = jnp.where(square > 0, 1 / jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
-    scale = jnp.where(surface.two_sided & (nx * slope_x + ny * slope_y + nz > 0), -scale, scale)
+    scale = jnp.where(two_sided & (nx * slope_x + ny * slope_y + nz > 0), -scale, scale)
     normal = jnp.stack([scale * nx, scale * ny, scale * nz], axis=-1)
-    sampled = optics.sample_texture(surface.texture, jnp.stack(inside(surface.uv), axis=-1))
+    places = jnp.stack(inside(surface.uv), axis=-1)
+    if isinstance(surface.texture, optics.Texels):
+        sampled = optics.sample_texels(surface.texture, owner, places)
+    else:
+        sampled = optics.sample_texture(surface.texture, places)
     albedo = jnp.stack([color * sampled[..., k] for k, color in enumerate(inside(surface.colors))], axis=-1)
-    height = depth - surface.sensor.camera.distance
-    color = planes(optics.shade(surface.sensor.room, albedo, normal, height, jnp.stack(empty, axis=-1), hidden))
+    height = depth - scene.sensor.camera.distance
+    color = planes(optics.shade(scene.sensor.room, albedo, normal, height, jnp.stack(empty, axis=-1), hidden))
     return [depth, *(jnp.where(on_pad, seen, behind) for seen, behind in zip(color, empty, strict=True))]
 
 
 def _imprint(
-    sensor: Sensor, resting: Resting, samples: _Samples, depth: Float[Array, "a b"], moving_edges: bool
+    sensor: Sensor, pressing: Bool[Array, "..."], samples: _Samples, depth: Float[Array, "a b"], moving_edges: bool
 ) -> Float[Array, "a b"]:
     """Depth of the imprint at the samples (m), 0 where the object does not touch the gel."""
     thickness, face = sensor.gel.thickness, jnp.asarray(sensor.camera.distance)
-    touched = samples.on_pad & resting.pressing & (depth < face)
+    touched = samples.on_pad & pressing & (depth < face)
     if not moving_edges:
         return jnp.where(touched, jnp.minimum(face - depth, thickness), 0)
     imprint = jnp.where(touched, jnp.minimum(face - jax.lax.stop_gradient(depth), thickness), 0)

@@ -16,15 +16,15 @@ from sts_jax.rendering.tiles import lines, where_active
 
 
 class Resting(NamedTuple):
-    """An object in balance on the gel."""
+    """An object, or n objects (`rendering.group`), in balance on the gel."""
 
     points: Float[Array, "v 3"]  # vertices in the sensor frame (m)
-    pose: Float[Array, "7"]  # pose in balance, or a pose below the pad if an input is invalid
-    shown: Float[Array, "7"]  # pose in balance, or the given pose if an input is invalid
+    pose: Float[Array, "*n 7"]  # pose in balance, or a pose below the pad if an input is invalid
+    shown: Float[Array, "*n 7"]  # pose in balance, or the given pose if an input is invalid
     heights: Float[Array, "r c"]  # heights of the underside above the gel's face, on the gel's grid (m)
-    present: Bool[Array, ""]  # True if a part of the object is above the gel's face
-    pressing: Bool[Array, ""]  # True if it is present, and Fz > 0 or no wrench is given
-    balanced: Bool[Array, ""]  # True if the gel balances the wrench within its limits
+    present: Bool[Array, ""]  # True if a part of an object is above the gel's face
+    pressing: Bool[Array, "*n"]  # True if it is present, and Fz > 0 or no wrench is given
+    balanced: Bool[Array, "*n"]  # True if the gel balances the wrench within its limits
     pressure: Float[Array, "r c"]  # pressure on the gel's grid (Pa)
 
 
@@ -41,14 +41,7 @@ def _balance(
 
     If `sound` is False (an invalid sensor or body), the object is placed below the pad, where it is not drawn.
     """
-    length = geometry.norm(jnp.where(jnp.isfinite(pose), pose, 0)[3:])
-    finite = sound & jnp.all(jnp.isfinite(pose)) & (length > 0) & jnp.isfinite(length)
-    if wrench is not None:
-        finite &= jnp.all(jnp.isfinite(wrench))
-        wrench = jnp.where(finite, wrench, 0)
-    safe_pose = jnp.where(finite, pose, jnp.array([0.0, 0, -1, 1, 0, 0, 0]))
-    safe_pose = jnp.concatenate([safe_pose[:3], geometry.normalize(safe_pose[3:])])
-
+    finite, safe_pose, wrench = safe(sound, pose, wrench)
     points = _placed(finite, safe_pose, vertices, jnp.full_like(vertices, -1))
     present = _cpu_reductions.maximum(points[:, 2]) > 0
     heights, whole = underside(gel, faces, two_sided, points, present)
@@ -58,7 +51,7 @@ def _balance(
     else:
         contact = tactile.settle(gel, heights, jnp.where(present, wrench, 0))
         pressing = present & (wrench[2] > 0)
-    balanced_pose = _moved(safe_pose, contact)
+    balanced_pose = moved(safe_pose, contact)
     return Resting(
         points=_placed(pressing, balanced_pose, vertices, points),
         pose=balanced_pose,
@@ -74,21 +67,34 @@ def _balance(
 balance = jax.jit(looped(_balance))
 
 
+def safe(
+    sound: Bool[Array, ""], pose: Float[Array, "7"], wrench: Float[Array, "6"] | None
+) -> tuple[Bool[Array, ""], Float[Array, "7"], Float[Array, "6"] | None]:
+    """True if all inputs are valid, with the pose and the wrench, or else with a pose below the pad and no load."""
+    length = geometry.norm(jnp.where(jnp.isfinite(pose), pose, 0)[3:])
+    finite = sound & jnp.all(jnp.isfinite(pose)) & (length > 0) & jnp.isfinite(length)
+    if wrench is not None:
+        finite &= jnp.all(jnp.isfinite(wrench))
+        wrench = jnp.where(finite, wrench, 0)
+    pose = jnp.where(finite, pose, jnp.array([0.0, 0, -1, 1, 0, 0, 0]))
+    return finite, jnp.concatenate([pose[:3], geometry.normalize(pose[3:])]), wrench
+
+
 def underside(
     gel: tactile.Gel,
     faces: Int[Array, "f 3"],
-    two_sided: Bool[Array, ""],
+    two_sided: Bool[Array, "*f"],
     points: Float[Array, "v 3"],
-    present: Bool[Array, ""],
+    present: Bool[Array, "*v"],
 ) -> tuple[Float[Array, "r c"], Float[Array, "r c"]]:
     """Heights of an object's underside above the gel's face (m), on the gel's grid, `inf` at cells without a face.
 
     Args:
         gel: Constants of the gel.
         faces: Vertex indices of the object's faces.
-        two_sided: True if faces are also visible from behind.
+        two_sided: True if faces, or each face, are also visible from behind.
         points: Vertices in the sensor frame (m).
-        present: If False, the object is ignored.
+        present: If False, the object is ignored. One flag for each vertex ignores the faces with such a corner.
 
     Returns:
         The map of only those faces that are low enough to press on the gel, and the map of all faces, because each of
@@ -110,7 +116,8 @@ def underside(
     return jnp.where(winner == near, whole, jnp.inf), whole
 
 
-def _moved(pose: Float[Array, "7"], contact: tactile.Equilibrium) -> Float[Array, "7"]:
+def moved(pose: Float[Array, "7"], contact: tactile.Equilibrium) -> Float[Array, "7"]:
+    """Pose after the motion to the equilibrium."""
     turn = geometry.quat_from_rotvec(jnp.concatenate([contact.turn, jnp.zeros(1)]))
     drop = jnp.stack([jnp.float32(0), jnp.float32(0), -contact.sink])
     position = geometry.transform(jnp.concatenate([drop, turn]), pose[:3])
