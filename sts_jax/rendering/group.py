@@ -5,6 +5,7 @@ the sensor, such as those of a floor, are clipped at the depth `Camera.near`, be
 pinhole is not drawn. What is nearer than this depth neither presses nor hides the sky.
 """
 
+import contextlib
 import dataclasses
 import functools
 from collections.abc import Sequence
@@ -34,13 +35,6 @@ class _Attributes(NamedTuple):
     uv: Float[Array, "s 3 2"]
 
 
-class _Large(NamedTuple):
-    """Faces that are clipped."""
-
-    faces: Int[Array, "l 3"]  # vertex indices
-    surface: _Attributes
-
-
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Group:
@@ -57,7 +51,7 @@ class Group:
     owner: Int[Array, "f"]  # body of each face
     two_sided: Bool[Array, "f"]  # True if the face is also visible from behind
     surface: _Attributes  # of the faces that are not clipped
-    large: _Large | None  # faces that are clipped, None if there are none
+    large: tuple[Int[Array, "l 3"], _Attributes] | None  # faces that are clipped, None if there are none
     texels: optics.Texels
     of_body: Int[Array, "n m"]  # indices of each body's faces, filled up with the last face
 
@@ -96,7 +90,7 @@ def group(bodies: Sequence[Body], longest: float = LONGEST) -> Group:
 
     def joined(values: Sequence[Any], length: int, fill: Any = 0) -> Any:
         """All rows of several arrays, filled up to a length."""
-        row = np.broadcast_to(fill, np.shape(values[0])[1:])
+        row = np.broadcast_to(np.asarray(fill, values[0].dtype), values[0].shape[1:])
         return xp.concatenate([*values, np.broadcast_to(row, (length - sum(map(len, values)), *row.shape))])
 
     def attributes(of_parts: Sequence[np.ndarray], length: int) -> list[Any]:
@@ -132,25 +126,23 @@ def group(bodies: Sequence[Body], longest: float = LONGEST) -> Group:
     most = _power(max(map(len, rows)))
     sides = np.array([len(body.texture) for body in bodies])
     texels = len(bodies) if (sides == 1).all() else _power(int((sides**2).sum()))
-    made = Group(
-        vertices=joined([part.vertices for part in parts], num_vertices),
-        vertex_owner=xp.asarray(np.concatenate([of_vertex, np.repeat(of_large, 4)]), np.int32),
-        faces=xp.asarray(faces, np.int32),
-        owner=xp.asarray(owner, np.int32),
-        two_sided=xp.stack([body.two_sided for body in bodies])[owner],
-        surface=_Attributes(*attributes(small, num_small)),
-        large=_Large(xp.asarray(large_faces, np.int32), _Attributes(*attributes(large, num_large)))
-        if num_large
-        else None,
-        texels=optics.Texels(
+    parts_of_group = {
+        "vertices": joined([part.vertices for part in parts], num_vertices),
+        "vertex_owner": np.concatenate([of_vertex, np.repeat(of_large, 4)]).astype(np.int32),
+        "faces": faces.astype(np.int32),
+        "owner": owner.astype(np.int32),
+        "two_sided": xp.stack([body.two_sided for body in bodies])[owner],
+        "surface": _Attributes(*attributes(small, num_small)),
+        "large": (large_faces.astype(np.int32), _Attributes(*attributes(large, num_large))) if num_large else None,
+        "texels": optics.Texels(
             joined([xp.asarray(body.texture).reshape(-1, 3) for body in bodies], texels),
-            xp.asarray(np.cumsum(sides**2) - sides**2, np.int32),
-            xp.asarray(sides, np.int32),
+            (np.cumsum(sides**2) - sides**2).astype(np.int32),
+            sides.astype(np.int32),
         ),
-        of_body=xp.asarray([np.pad(r, (0, most - len(r)), constant_values=len(owner) - 1) for r in rows], np.int32),
-    )
-    with jax.ensure_compile_time_eval():
-        return jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf, made)
+        "of_body": np.array([np.pad(r, (0, most - len(r)), constant_values=len(owner) - 1) for r in rows], np.int32),
+    }
+    with contextlib.nullcontext() if traced else jax.ensure_compile_time_eval():
+        return Group(**jax.tree.map(jnp.asarray, parts_of_group))
 
 
 class _Part(NamedTuple):
@@ -285,7 +277,7 @@ def _placed(
     points = jnp.stack([jnp.where(there[owner], part, lowest - 1) for part in parts], axis=-1)
     if group.large is None:
         return _Placed(points, None)
-    corners = points[group.large.faces]
+    corners = points[group.large[0]]
     shares, cut = _clip(corners[..., 2], lowest)
     clipped = _mixed(shares, corners)
     # Rounding must not put a corner below the plane at which the faces are cut.
@@ -358,5 +350,5 @@ def _surface(group: Group, shares: Float[Array, "l 4 3"] | None) -> Surface:
             pairs = jnp.stack([corners[:, :3], corners[:, jnp.array([0, 2, 3])]], axis=1)
             return jnp.concatenate([pairs.reshape(-1, *small.shape[1:]), small])
 
-        surface = jax.tree.map(whole, group.large.surface, surface)
+        surface = jax.tree.map(whole, group.large[1], surface)
     return Surface(group.faces, *surface, group.texels, group.two_sided, group.owner)
