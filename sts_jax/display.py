@@ -156,6 +156,8 @@ def load(path: str | os.PathLike[str]) -> Any:
         kind, version = _KINDS[str(arrays.pop("kind"))], int(arrays.pop("format"))
         if version != _FORMAT:
             raise ValueError(f"the file has format {version}, but this version of sts_jax reads format {_FORMAT}")
+        if kind is Frame and "segmentation" in arrays:  # a file from before frames of several bodies
+            arrays.setdefault("body", np.where(arrays["segmentation"], 0, -1))
         _check_stored(kind, arrays)
         return _built(kind, {key: jnp.asarray(value) for key, value in arrays.items()})
     except Exception as error:  # A damaged zip file raises exceptions of many types.
