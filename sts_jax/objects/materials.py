@@ -1,5 +1,6 @@
 """Colours and textures of mesh files."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,29 +23,40 @@ def albedo(path: Path, pieces: list[trimesh.Trimesh]) -> tuple[np.ndarray, np.nd
         colors.append(np.clip(color, 0, 1))
         uvs.append(uv)
         images.append(image)
-    pictures = [image for image in images if image is not None]
-    if not pictures:
-        return np.concatenate(colors), np.concatenate(uvs), None
     try:
-        sheets = [np.asarray(rgb(picture)) for picture in pictures]
+        sheets = [None if image is None else np.asarray(rgb(image)) for image in images]
     except (OSError, SyntaxError, ValueError) as error:
         raise ValueError(f"a texture of the mesh cannot be read ({error}): replace the texture") from error
+    uv, texture = combined(sheets, uvs)
+    return np.concatenate(colors), uv, texture
+
+
+def combined(sheets: Sequence[np.ndarray | None], uvs: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray | None]:
+    """Combine the textures of several pieces, sRGB with 8 bits or None, into one square texture in linear light.
+
+    Returns:
+        Texture coordinates of all faces, (f, 3, 2), and the texture, None if no piece has one.
+    """
     distinct: list[np.ndarray] = []
     cell = []
     for sheet in sheets:
+        if sheet is None:
+            continue
         same = [i for i, other in enumerate(distinct) if np.array_equal(other, sheet)]
         cell.append(same[0] if same else len(distinct))
         if not same:
             distinct.append(sheet)
-    plain = len(distinct) if any(image is None for image in images) else -1
+    if not distinct:
+        return np.concatenate(uvs), None
+    plain = len(distinct) if any(sheet is None for sheet in sheets) else -1
     if plain >= 0:  # the texture of untextured pieces is a white cell
         distinct.append(np.full((8, 8, 3), 255, np.uint8))
     if len(distinct) == 1:
         texture = _square(distinct[0], _texture_class(max(distinct[0].shape[:2])))
     else:
         cells = iter(cell)
-        texture, uvs = _packed(distinct, uvs, [plain if image is None else next(cells) for image in images])
-    return np.concatenate(colors), np.concatenate(uvs), linear(texture / 255.0)
+        texture, uvs = _packed(distinct, uvs, [plain if sheet is None else next(cells) for sheet in sheets])
+    return np.concatenate(uvs), linear(texture / 255.0)
 
 
 def _packed(sheets: list[np.ndarray], uvs: list[np.ndarray], cells: list[int]) -> tuple[np.ndarray, list[np.ndarray]]:

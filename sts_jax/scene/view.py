@@ -1,0 +1,340 @@
+"""`View`: what the sensors in a MuJoCo scene see and feel, as a pure function of MuJoCo's data."""
+
+import dataclasses
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from scipy.spatial.transform import Rotation
+
+from sts_jax import geometry
+from sts_jax._checked import checked, in_32_bits
+from sts_jax._ranges import MOST_PIXELS
+from sts_jax.frame import Frame
+from sts_jax.objects.body import Body
+from sts_jax.physics.scene import mjx
+from sts_jax.rendering.group import Group, draw_group, group
+from sts_jax.scene.geometry import body_of, geom_name, visible
+from sts_jax.scene.pad import BY_DISTANCE, DATA
+from sts_jax.sensor import Sensor
+
+_CONTACT = 17  # numbers that a sensor of `attach` stores of each contact
+_OVERHANG = 1.02  # a pad may be larger than its finger by this factor
+_GEOM = mujoco.mjtObj.mjOBJ_GEOM
+
+
+class _Pad(NamedTuple):
+    """One sensor of the scene, with k bodies that it can see. Numbers of bodies are MuJoCo's."""
+
+    sensor: Sensor  # with `camera.near` at the gel's inner face
+    site: int  # number of the site that is the sensor frame
+    places: Int[np.ndarray, "s 17"]  # indices into `sensordata`, one row for each stored contact
+    touched: Int[np.ndarray, "s"]  # body of each contact
+    bodies: Int[np.ndarray, "k"]  # bodies that it can see
+    group: Group  # their geometry
+    names: Int[np.ndarray, "k"]  # their places in `View.bodies`
+
+
+class View:
+    """The sensors in a MuJoCo scene. Calling it with MuJoCo's data returns one `Frame` for each sensor.
+
+    A view is made once for a model, whose geometry it keeps. It is a pure function of the data, which works under
+    `jit`, `vmap` and `grad`, and reads only `xpos`, `xquat`, `site_xpos`, `site_xmat` and `sensordata`:
+
+        frames = view(data)                           # mujoco.MjData, or mjx.Data of one environment
+        frames = jax.jit(jax.vmap(view))(batch)       # mjx.Data of many environments
+
+    Each body that presses on a sensor has its own equilibrium on the gel. The body that carries a sensor is not seen by
+    it (on the world: only the pad is not seen), and neither is anything below the gel.
+
+    Attributes:
+        bodies: Names of the bodies that are drawn, in the order of `Frame.body`.
+    """
+
+    @checked
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        sensors: Mapping[str, Sensor],
+        *,
+        bodies: Mapping[str, Body] = MappingProxyType({}),
+        groups: Collection[int] | None = None,
+        hide: Collection[str] = (),
+    ) -> None:
+        """Gather the geometry of a model.
+
+        Args:
+            model: Model that was compiled after `attach`.
+            sensors: The sensor of each pad, by the name that `attach` got.
+            bodies: Bodies that are drawn in place of the geoms of a MuJoCo body, by its name. Their mesh frame is the
+                frame of the MuJoCo body.
+            groups: Groups of geoms that are drawn. None: the visual geoms of each body (`contype` and `conaffinity` are
+                0), or all its geoms if it has no visual ones.
+            hide: Names of bodies and geoms that are not drawn.
+        """
+        pads = {name: _pad_geom(model, name, sensor) for name, sensor in sensors.items()}
+        for name in pads:
+            _check_finger(model, name, pads)
+        if not pads:
+            raise ValueError("sensors is empty: name each pad and its sensor, as in {'left': sensor}")
+        names = {_body_name(model, body): body for body in range(model.nbody)}
+        _check_names(model, names, bodies, hide, pads)
+        shown = np.union1d(visible(model, groups), list(pads.values()))
+        hidden = [
+            geom for geom in shown if {model.geom(geom).name, _body_name(model, model.geom_bodyid[geom])} & {*hide}
+        ]
+        shown = np.setdiff1d(shown, hidden)
+        replaced = {names[name]: body for name, body in bodies.items() if name not in hide}
+        drawn = sorted({*model.geom_bodyid[shown].tolist(), *replaced})
+        made: dict[tuple[int, ...], Body] = {}
+
+        def body(owner: int, without: int) -> Body | None:
+            geoms = tuple(shown[(model.geom_bodyid[shown] == owner) & (shown != without)].tolist())
+            if owner in replaced:
+                return replaced[owner]
+            if geoms and geoms not in made:
+                made[geoms] = body_of(model, geoms)
+            return made.get(geoms)
+
+        self._shapes = {
+            "xpos": (model.nbody, 3),
+            "xquat": (model.nbody, 4),
+            "site_xpos": (model.nsite, 3),
+            "sensordata": (model.nsensordata,),
+        }
+        self._names = {number: name for name, number in names.items()}
+        self.bodies: tuple[str, ...] = tuple(self._names[number] for number in drawn)
+        self._pads: dict[str, _Pad] = {}
+        for name, pad in pads.items():
+            carrier, sensor = model.geom_bodyid[pad], sensors[name]
+            # Behind the gel is the sensor's housing, where nothing is seen.
+            near = float(sensor.camera.distance) - float(sensor.gel.thickness)
+            sensor = dataclasses.replace(sensor, camera=dataclasses.replace(sensor.camera, near=near))
+            seen = {owner: body(owner, pad) for owner in drawn if owner != carrier or carrier == 0}
+            present = {owner: one for owner, one in seen.items() if one is not None}
+            if not present:
+                raise ValueError(f"the sensor {name!r} can see no body: add one to the model, or hide fewer")
+            places, touched = _contacts(model, pad)
+            self._pads[name] = _Pad(
+                sensor=sensor,
+                site=model.site(name).id,
+                places=places,
+                touched=touched,
+                bodies=np.array(list(present)),
+                group=group(list(present.values())),
+                names=np.searchsorted(drawn, list(present)).astype(np.int32),
+            )
+
+    @in_32_bits
+    @checked
+    def __call__(self, data: mujoco.MjData | mjx.Data, *, resolution: tuple[int, int] = (64, 64)) -> dict[str, Frame]:
+        """Render the images of all sensors.
+
+        Args:
+            data: Data after a step, or after `mj_forward`. For a batch use `jax.vmap`.
+            resolution: Height and width of the images (pixels).
+
+        Returns:
+            One frame for each sensor. `Frame.pose` and `Frame.balanced` have one row for each of the bodies that this
+            sensor can see, in the order of `bodies`. `Frame.body` is the index in `bodies` of the body that is seen.
+        """
+        if not all(1 <= side <= MOST_PIXELS for side in resolution):
+            raise ValueError(f"resolution (height, width) must be from 1 to {MOST_PIXELS:,} pixels, got {resolution}")
+        arrays, frames = self._read(data), {}
+        for name, pad in self._pads.items():
+            poses, wrenches = _poses(arrays, pad.site, pad.bodies), _felt(arrays, pad, pad.bodies)
+            drawn = draw_group(pad.sensor, pad.group, poses, wrenches, resolution=resolution)
+            body = jnp.where(drawn.body < 0, -1, jnp.asarray(pad.names)[drawn.body])
+            frames[name] = Frame(**drawn._replace(body=body)._asdict())
+        return frames
+
+    @in_32_bits
+    @checked
+    def wrenches(self, data: mujoco.MjData | mjx.Data) -> dict[str, dict[str, Float[Array, "6"]]]:
+        """Force (N) and moment (N m) that each sensor exerts on each body that can touch it, in the sensor frame."""
+        arrays, wrenches = self._read(data), {}
+        for name, pad in self._pads.items():
+            bodies = np.unique(pad.touched)
+            rows = zip(bodies.tolist(), _felt(arrays, pad, bodies), strict=True)
+            wrenches[name] = {self._names[body]: row for body, row in rows}
+        return wrenches
+
+    def _read(self, data: Any) -> "_Arrays":
+        """The public arrays of MuJoCo's data, in 32 bits."""
+        if np.ndim(data.xpos) > 2:
+            raise ValueError(f"data is a batch (xpos has the shape {data.xpos.shape}): use jax.vmap(view)(data)")
+        for name, shape in self._shapes.items():
+            if np.shape(getattr(data, name)) != shape:
+                raise ValueError(
+                    f"data.{name} has the shape {np.shape(getattr(data, name))}, but in the view's model it has "
+                    f"{shape}: this is the data of another model, so make a View of that model"
+                )
+        if isinstance(data, mujoco.MjData) and not data.xquat.any():
+            raise ValueError("data has no positions yet: call mujoco.mj_forward(model, data) before")
+        xmat = jnp.asarray(data.site_xmat, jnp.float32).reshape(-1, 3, 3)
+        return _Arrays(*(jnp.asarray(getattr(data, name), jnp.float32) for name in self._shapes), xmat)
+
+
+class _Arrays(NamedTuple):
+    """What is read of MuJoCo's data."""
+
+    xpos: Float[Array, "b 3"]
+    xquat: Float[Array, "b 4"]
+    site_xpos: Float[Array, "t 3"]
+    sensordata: Float[Array, "d"]
+    site_xmat: Float[Array, "t 3 3"]
+
+
+@jax.jit
+def _poses(arrays: _Arrays, site: Int[Array, ""], bodies: Int[Array, "k"]) -> Float[Array, "k 7"]:
+    """Poses of bodies in a sensor frame."""
+    turn = arrays.site_xmat[site]
+    position = (arrays.xpos[bodies] - arrays.site_xpos[site]) @ turn
+    inverse = geometry.quat_inverse(geometry.quat_from_matrix(turn))
+    return jnp.concatenate([position, geometry.quat_multiply(inverse, arrays.xquat[bodies])], axis=1)
+
+
+def _felt(arrays: _Arrays, pad: _Pad, bodies: Int[np.ndarray, "k"]) -> Float[Array, "k 6"]:
+    """Wrenches that a pad exerts on bodies, in the sensor frame."""
+    return _wrenches(arrays, pad.site, pad.places, pad.touched[None, :] == bodies[:, None], pad.sensor.gel.thickness)
+
+
+@jax.jit
+def _wrenches(
+    arrays: _Arrays,
+    site: Int[Array, ""],
+    places: Int[Array, "s 17"],
+    counts: Bool[Array, "k s"],
+    thickness: Float[Array, ""] | float,
+) -> Float[Array, "k 6"]:
+    contact = arrays.sensordata[places]
+    force, torque, point, normal, tangent = (contact[:, k : k + 3] for k in (1, 4, 8, 11, 14))
+    turn = arrays.site_xmat[site]
+    frame = jnp.stack([normal, tangent, jnp.cross(normal, tangent)], axis=1) @ turn
+    point = (point - arrays.site_xpos[site]) @ turn
+    # A normal points from one geom to the other, but MJX 3.17 swaps the two for some pairs of types. Out of the pad is
+    # away from a point deep inside it.
+    inside = jnp.array([0.0, 0.0, -0.75]) * thickness
+    outward = jnp.sign(jnp.sum((point - inside) * frame[:, 0], axis=1))
+    force, torque = (jnp.einsum("s,si,sij->sj", outward, part, frame) for part in (force, torque))
+    return counts.astype(jnp.float32) @ jnp.concatenate([force, jnp.cross(point, force) + torque], axis=1)
+
+
+def _pad_geom(model: mujoco.MjModel, name: str, sensor: Sensor) -> int:
+    """Number of a pad's geom, after checks that the model fits the sensor."""
+    sensor.check()
+    pad = mujoco.mj_name2id(model, _GEOM, name)
+    if pad < 0 or mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, name) < 0:
+        raise ValueError(
+            f"the model has no pad {name!r}: call scene.attach(spec, site, sensor, name={name!r}) before spec.compile()"
+        )
+    (width, height), thickness = sensor.gel.size, float(sensor.gel.thickness)
+    wanted = np.array([float(width), float(height), thickness])
+    if not np.allclose(2 * model.geom_size[pad], wanted, rtol=1e-4):
+        raise ValueError(
+            f"the pad {name!r} measures {_millimetres(2 * model.geom_size[pad])}, but its sensor has a gel of "
+            f"{_millimetres(wanted)}: give the sensor that scene.attach got"
+        )
+    touchable = _touchable(model, pad)
+    if missing := sorted({*touchable.tolist()} - {other for other, _ in _sensors(model, pad)}):
+        raise ValueError(
+            f"geom {geom_name(model, missing[0])} can touch the pad {name!r}, but no sensor measures it: add all "
+            "bodies to the specification before scene.attach"
+        )
+    return int(pad)
+
+
+def _check_finger(model: mujoco.MjModel, name: str, pads: Mapping[str, int]) -> None:
+    """Raise a ValueError if a pad is larger than the body that carries it, seen along the pad's normal."""
+    pad, site = pads[name], model.site(name)
+    carrier = int(model.geom_bodyid[pad])
+    geoms = np.setdiff1d(np.flatnonzero(model.geom_bodyid == carrier), list(pads.values()))
+    if carrier == 0 or not len(geoms):
+        return
+    turn = Rotation.from_quat(site.quat, scalar_first=True).as_matrix()
+    signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), axis=-1).reshape(8, 3)
+    corners = []
+    for geom in geoms:
+        box = model.geom_aabb[geom]
+        turned = Rotation.from_quat(model.geom_quat[geom], scalar_first=True).apply(box[:3] + signs * box[3:])
+        corners.append((turned + model.geom_pos[geom] - site.pos) @ turn)
+    size, finger = 2 * model.geom_size[pad][:2], np.ptp(np.concatenate(corners), axis=0)[:2]
+    if (size > _OVERHANG * finger).any():
+        raise ValueError(
+            f"the pad {name!r} measures {_millimetres(size)}, but the body {_body_name(model, carrier)!r} that carries "
+            f"it only {_millimetres(finger)}: use a smaller sensor, such as Sensor.sized({finger.min():.3g}), or put "
+            "the site on a body without other geoms"
+        )
+
+
+def _touchable(model: mujoco.MjModel, pad: int) -> Int[np.ndarray, "k"]:
+    """Geoms whose contacts with a pad MuJoCo computes."""
+    weld, owner = model.body_weldid, model.geom_bodyid
+    parent = weld[model.body_parentid[weld]]
+    mine, theirs = weld[owner[pad]], weld[owner]
+    allowed = (model.geom_contype[pad] & model.geom_conaffinity) | (model.geom_contype & model.geom_conaffinity[pad])
+    touches = (allowed != 0) & (theirs != mine)
+    if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT and mine != 0:
+        touches &= (theirs == 0) | ((parent[owner] != mine) & (parent[owner[pad]] != theirs))
+    low, high = np.minimum(owner, owner[pad]), np.maximum(owner, owner[pad])
+    touches &= ~np.isin((low << 16) + high, model.exclude_signature)
+    first, second = model.pair_geom1, model.pair_geom2
+    return np.union1d(np.flatnonzero(touches), np.concatenate([second[first == pad], first[second == pad]]))
+
+
+def _sensors(model: mujoco.MjModel, pad: int) -> Iterator[tuple[int, int]]:
+    """Geoms on the other side of the contact sensors of a pad, with the numbers of these sensors."""
+    kind = (model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT) & (model.sensor_objtype == _GEOM)
+    kind &= (model.sensor_reftype == _GEOM) & (model.sensor_intprm[:, :2] == [DATA, BY_DISTANCE]).all(axis=1)
+    for sensor in np.flatnonzero(kind):
+        one, other = int(model.sensor_objid[sensor]), int(model.sensor_refid[sensor])
+        if pad in (one, other):
+            yield (other if pad == one else one), int(sensor)
+
+
+def _contacts(model: mujoco.MjModel, pad: int) -> tuple[Int[np.ndarray, "s 17"], Int[np.ndarray, "s"]]:
+    """Indices into the sensor data of each stored contact of a pad, and the body of each contact."""
+    places, bodies = [np.zeros((0, _CONTACT), int)], [np.zeros(0, int)]
+    for other, sensor in dict(_sensors(model, pad)).items():
+        start, length = model.sensor_adr[sensor], model.sensor_dim[sensor]
+        places.append((start + np.arange(length)).reshape(-1, _CONTACT))
+        bodies.append(np.full(length // _CONTACT, model.geom_bodyid[other]))
+    return np.concatenate(places), np.concatenate(bodies)
+
+
+def _check_names(
+    model: mujoco.MjModel,
+    names: Collection[str],
+    bodies: Mapping[str, Body],
+    hide: Collection[str],
+    pads: Mapping[str, int],
+) -> None:
+    listed = ", ".join(map(repr, names))
+    for name in bodies:
+        if name not in names:
+            raise ValueError(f"bodies has the name {name!r}, but the model has only the bodies {listed}")
+        carried = [pad for pad, geom in pads.items() if _body_name(model, model.geom_bodyid[geom]) == name]
+        if carried:
+            raise ValueError(
+                f"bodies has the name {name!r}, but this body carries the pad {carried[0]!r}: a body is a pad or an "
+                "object, not both"
+            )
+        bodies[name].check()
+    for name in hide:
+        if name not in names and mujoco.mj_name2id(model, _GEOM, name) < 0:
+            raise ValueError(
+                f"hide has the name {name!r}, which is no geom, and the model has only the bodies {listed}"
+            )
+
+
+def _body_name(model: mujoco.MjModel, body: int | np.integer) -> str:
+    return model.body(body).name or f"body {body}"
+
+
+def _millimetres(size: Iterable[float]) -> str:
+    return " x ".join(f"{1e3 * side:.4g}" for side in size) + " mm"
