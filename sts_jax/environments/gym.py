@@ -1,0 +1,99 @@
+"""`GymLift`: the task as an environment of Gymnasium, in C MuJoCo. The import registers it as `sts_jax/Lift-v0`."""
+
+from typing import Any
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from sts_jax.environments.playground import picture
+from sts_jax.environments.task import ACTIONS, PADS, STREAMS, Start, Task, judge, placed, proprioception, target
+from sts_jax.environments.task import setting as task_setting
+from sts_jax.objects.body import Body
+from sts_jax.sensor import Sensor
+
+try:
+    import gymnasium
+    from gymnasium import spaces
+except ImportError as error:
+    raise ImportError(
+        "the environment of Gymnasium needs the package gymnasium, which is not installed: pip install gymnasium"
+    ) from error
+
+EPISODE = 150  # actions of an episode of `gymnasium.make`
+
+Observation = dict[str, np.ndarray]
+
+
+class GymLift(gymnasium.Env[Observation, np.ndarray]):
+    """Close on an object and lift it. Actions and observations are those of `Lift`, but images are uint8 (0 to 255).
+
+    `reset` draws the pose and the friction of the object. The dictionary `info` has the terms of the reward without
+    their weights, and the friction. An episode terminates if the object is lost. `gymnasium.make` truncates it after
+    EPISODE actions.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 (Gymnasium's own annotation)
+
+    def __init__(
+        self,
+        sensor: Sensor | None = None,
+        body: Body | None = None,
+        task: Task | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        """Build the scene. The arguments are those of `Lift`; `render_mode` may be "rgb_array"."""
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"render_mode is {render_mode!r}, but it must be 'rgb_array' or None")
+        self.task, self.render_mode = Task() if task is None else task, render_mode
+        self.metadata = {**self.metadata, "render_fps": round(1 / self.task.control_dt)}
+        self.setting = task_setting(Sensor.sized(0.04) if sensor is None else sensor, body, self.task)
+        self.model, self.data = self.setting.model, mujoco.MjData(self.setting.model)
+        self.action_space = spaces.Box(-1, 1, (len(ACTIONS),), np.float32)
+        image = spaces.Box(0, 255, (*self.task.resolution, 3), np.uint8)
+        images = {f"pixels/{pad}_{name}": image for pad in PADS for name in STREAMS}
+        self.observation_space = spaces.Dict({"state": spaces.Box(-np.inf, np.inf, (6,), np.float32), **images})
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict]:
+        """Begin an episode with the open gripper around the object, whose pose and friction are drawn."""
+        super().reset(seed=seed)
+        task, draw = self.task, self.np_random.uniform
+        start = Start(draw(-task.offset, task.offset, 2), draw(-task.yaw, task.yaw), draw(*task.friction))
+        self.model.geom_friction[self.setting.geoms, 0] = start.friction
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:] = placed(self.setting, start)
+        self.data.ctrl[:] = self.setting.home.ctrl
+        mujoco.mj_forward(self.model, self.data)
+        return self._observe(), self._judge()[2]
+
+    def step(self, action: Float[np.ndarray, "2"]) -> tuple[Observation, float, bool, bool, dict]:
+        """Move the targets of the servos, and advance the physics by `task.control_dt`."""
+        self.data.ctrl[:] = target(self.setting, self.task, self.data.ctrl, action)
+        mujoco.mj_step(self.model, self.data, self.task.substeps)
+        reward, lost, info = self._judge()
+        return self._observe(), reward, lost, False, info
+
+    def render(self) -> np.ndarray | None:
+        """Images of the sensors, uint8: left and right pad, visual stream above tactile stream."""
+        if self.render_mode is None:
+            return None
+        frames = self.setting.view(self.data, resolution=(240, 320))
+        return picture([[getattr(frames[pad], name) for pad in PADS] for name in STREAMS])
+
+    def _judge(self) -> tuple[float, bool, dict[str, float]]:
+        wrenches, body = self.setting.view.wrenches(self.data), self.setting.body
+        forces = np.array([wrenches[pad]["object"][2] for pad in PADS])
+        reward, terms, lost = judge(
+            self.task, self.data.xpos[body], self.setting.home.xpos[body, 2], forces, self.data.qpos
+        )
+        info = {name: float(term) for name, term in terms._asdict().items()}
+        return float(reward), bool(lost), info | {"friction": float(self.model.geom_friction[self.setting.geoms[0], 0])}
+
+    def _observe(self) -> Observation:
+        frames = self.setting.view(self.data, resolution=self.task.resolution)
+        images = {f"pixels/{pad}_{name}": picture([[getattr(frames[pad], name)]]) for pad in PADS for name in STREAMS}
+        state = proprioception(self.data.qpos, self.data.qvel, self.data.ctrl)
+        return {"state": np.asarray(state), **images}
+
+
+gymnasium.register("sts_jax/Lift-v0", entry_point=GymLift, max_episode_steps=EPISODE)
