@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from sts_jax.environments.playground import picture
+from sts_jax.environments.playground import picture, to_uint8
 from sts_jax.environments.task import ACTIONS, PADS, STREAMS, Start, Task, judge, placed, proprioception, target
 from sts_jax.environments.task import setting as task_setting
 from sts_jax.objects.body import Body
@@ -74,11 +74,10 @@ class GymLift(gymnasium.Env[Observation, np.ndarray]):
         return self._observe(), reward, lost, False, info
 
     def render(self) -> np.ndarray | None:
-        """Images of the sensors, uint8: left and right pad, visual stream above tactile stream."""
+        """Images of the observation in one, uint8: left and right pad, visual stream above tactile stream."""
         if self.render_mode is None:
             return None
-        frames = self.setting.view(self.data, resolution=(240, 320))
-        return picture([[getattr(frames[pad], name) for pad in PADS] for name in STREAMS])
+        return picture(self.setting.view(self.data, resolution=self.task.resolution))
 
     def _judge(self) -> tuple[float, bool, dict[str, float]]:
         wrenches, body = self.setting.view.wrenches(self.data), self.setting.body
@@ -91,7 +90,7 @@ class GymLift(gymnasium.Env[Observation, np.ndarray]):
 
     def _observe(self) -> Observation:
         frames = self.setting.view(self.data, resolution=self.task.resolution)
-        images = {f"pixels/{pad}_{name}": picture([[getattr(frames[pad], name)]]) for pad in PADS for name in STREAMS}
+        images = {f"pixels/{pad}_{name}": to_uint8(getattr(frames[pad], name)) for pad in PADS for name in STREAMS}
         state = proprioception(self.data.qpos, self.data.qvel, self.data.ctrl)
         return {"state": np.asarray(state), **images}
 

@@ -1,8 +1,7 @@
 """`Lift`: the task as an environment in the style of MuJoCo Playground, in MJX."""
 
 import dataclasses
-import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -14,6 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from sts_jax._checked import in_32_bits
 from sts_jax.environments.task import ACTIONS, PADS, STREAMS, Reward, Start, Task, judge, placed, proprioception, target
 from sts_jax.environments.task import setting as task_setting
+from sts_jax.frame import Frame
 from sts_jax.objects.body import Body
 from sts_jax.physics.scene import mjx
 from sts_jax.sensor import Sensor
@@ -123,12 +123,7 @@ class Lift:
         """
         if not isinstance(trajectory, State):
             return [np.asarray(self.render(state, height, width)) for state in trajectory]
-        return picture(self._images(trajectory.data, (height, width)))
-
-    @functools.partial(jax.jit, static_argnums=(0, 2))
-    def _images(self, data: mjx.Data, resolution: tuple[int, int]) -> list[list[Array]]:
-        frames = self.setting.view(data, resolution=resolution)
-        return [[getattr(frames[pad], name) for pad in PADS] for name in STREAMS]
+        return picture(self.setting.view(trajectory.data, resolution=(height, width)))
 
     @property
     def action_size(self) -> int:
@@ -178,7 +173,12 @@ class Lift:
         return self
 
 
-def picture(rows: Sequence[Sequence[Any]]) -> np.ndarray:
-    """Join images in [0, 1] into one image of uint8, row by row."""
-    joined = np.concatenate([np.concatenate([np.asarray(image) for image in row], axis=1) for row in rows])
-    return np.round(255 * joined).astype(np.uint8)
+def picture(frames: Mapping[str, Frame]) -> np.ndarray:
+    """Join the images of both pads into one of uint8, the visual stream above the tactile stream."""
+    rows = [np.concatenate([np.asarray(getattr(frames[pad], name)) for pad in PADS], axis=1) for name in STREAMS]
+    return to_uint8(np.concatenate(rows))
+
+
+def to_uint8(image: np.ndarray | Array) -> np.ndarray:
+    """Convert an image in [0, 1]."""
+    return np.round(255 * np.asarray(image)).astype(np.uint8)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from sts_jax import geometry, scene
 from sts_jax._checked import checked
@@ -146,7 +146,11 @@ def proprioception(qpos: Any, qvel: Any, ctrl: Any) -> Float[Array, "6"]:
 
 @functools.partial(jax.jit, static_argnames="task")
 def judge(
-    task: Task, place: Float[Any, "3"], start: float, forces: Float[Any, "2"], qpos: Float[Any, "q"]
+    task: Task,
+    place: Float[ArrayLike, "3"],
+    start: Float[ArrayLike, ""],
+    forces: Float[ArrayLike, "2"],
+    qpos: Float[ArrayLike, "q"],
 ) -> tuple[Float[Array, ""], Reward, Bool[Array, ""]]:
     """Judge a state.
 
