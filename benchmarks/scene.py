@@ -83,7 +83,7 @@ def build(sensor: sts.Sensor, body: objects.Body | None = None) -> mujoco.MjMode
     spec = scene.gripper(sensor, body)
     for name, kind, size, y in (
         ("ball", mujoco.mjtGeom.mjGEOM_SPHERE, [0.02, 0, 0], 0.1),
-        ("can", mujoco.mjtGeom.mjGEOM_CYLINDER, [0.02, 0.02, 0], -0.1),
+        ("post", mujoco.mjtGeom.mjGEOM_CAPSULE, [0.02, 0.03, 0], -0.1),
     ):
         other = spec.worldbody.add_body(name=name, pos=[0, y, 0.02])
         other.add_geom(name=name, type=kind, size=size, rgba=[0.2, 0.45, 0.7, 1])
