@@ -18,6 +18,7 @@ as medians:
 import dataclasses
 import functools
 import os
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -181,10 +182,12 @@ def several(model: mujoco.MjModel, data: mujoco.MjData, number: int) -> mjx.Data
 
 def renderer_of(model: mujoco.MjModel, shape: tuple[int, int]) -> mujoco.Renderer | None:
     """MuJoCo's renderer, or None where there is no OpenGL."""
-    try:
-        return mujoco.Renderer(model, *shape)
-    except Exception:  # of many kinds, according to the library that is missing
-        return None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            return mujoco.Renderer(model, *shape)
+        except Exception:  # of many kinds, according to the library that is missing
+            return None
 
 
 class Work(NamedTuple):

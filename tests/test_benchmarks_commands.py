@@ -9,7 +9,7 @@ import pytest
 import tyro
 
 import sts_jax
-from benchmarks import device, faults, gap, hidden, sharpness, shipped
+from benchmarks import device, faults, gap, hidden, scene, sharpness, shipped
 
 ROOT = Path(__file__).parent.parent
 SOURCES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/**/*.md"), *ROOT.glob("benchmarks/**/*.py")]
@@ -57,6 +57,8 @@ PERTURBED = Path(sts_jax.__file__).parent / "models" / "perturbed"
         (lambda: gap.main(gap.Args(trajectories=9)), "--trajectories must be >= 10, got 9"),
         (lambda: gap.main(gap.Args(resolution=(64, 64))), "must have the aspect ratio"),
         (lambda: hidden.Args(soaked=Path("a"), objects=200), "--soaked provides the trajectories"),
+        (lambda: scene.Args(sizes=("64",)), "--sizes must be height x width, such as 64x64, got '64'"),
+        (lambda: scene.Args(envs=(0,)), r"--envs and --repeats must be at least 1, got \(0,\) and 3"),
         (lambda: sharpness.Args(("fog",)), r"unknown conditions \['fog'\]"),
         (lambda: sharpness.Args(trajectories=50), "--trajectories must be a multiple of 24, at least 48, got 50"),
         (lambda: shipped.main(shipped.Args("perturbed", objects=4)), "--objects must be at least 5, got 4"),
