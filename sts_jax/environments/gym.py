@@ -7,7 +7,18 @@ import numpy as np
 from jaxtyping import Float
 
 from sts_jax.environments.playground import picture, to_uint8
-from sts_jax.environments.task import ACTIONS, PADS, STREAMS, Start, Task, judge, placed, proprioception, target
+from sts_jax.environments.task import (
+    ACTIONS,
+    LARGEST,
+    PADS,
+    STREAMS,
+    Start,
+    Task,
+    judge,
+    placed,
+    proprioception,
+    target,
+)
 from sts_jax.environments.task import setting as task_setting
 from sts_jax.objects.body import Body
 from sts_jax.sensor import Sensor
@@ -52,7 +63,7 @@ class GymLift(gymnasium.Env[Observation, np.ndarray]):
         self.action_space = spaces.Box(-1, 1, (len(ACTIONS),), np.float32)
         image = spaces.Box(0, 255, (*self.task.resolution, 3), np.uint8)
         images = {f"pixels/{pad}_{name}": image for pad in PADS for name in STREAMS}
-        self.observation_space = spaces.Dict({"state": spaces.Box(-np.inf, np.inf, (6,), np.float32), **images})
+        self.observation_space = spaces.Dict({"state": spaces.Box(-LARGEST, LARGEST, (6,), np.float32), **images})
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict]:
         """Begin an episode with the open gripper around the object, whose pose and friction are drawn."""

@@ -17,6 +17,7 @@ from sts_jax.sensor import Sensor
 
 PADS = ("left", "right")
 STREAMS = ("visual", "tactile")
+LARGEST = 10.0  # largest number in the part of an observation that is no image
 ACTIONS = ("lift", "grip")  # an action's components, in the order of the actuators
 
 
@@ -139,9 +140,9 @@ def target(setting: Setting, task: Task, ctrl: Any, action: Any) -> Float[Array,
 
 
 def proprioception(qpos: Any, qvel: Any, ctrl: Any) -> Float[Array, "6"]:
-    """Height and opening of the gripper (m), their velocities (m/s) and their targets (m)."""
+    """Height and opening of the gripper (m), their velocities (m/s) and their targets (m), within LARGEST."""
     state = jnp.stack([qpos[0], qpos[1] + qpos[2], qvel[0], qvel[1] + qvel[2], *ctrl])
-    return jnp.nan_to_num(state, posinf=0, neginf=0).astype(jnp.float32)
+    return jnp.clip(jnp.nan_to_num(state), -LARGEST, LARGEST).astype(jnp.float32)
 
 
 @functools.partial(jax.jit, static_argnames="task")
