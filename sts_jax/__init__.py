@@ -1,6 +1,7 @@
 """The See-Through-your-Skin (STS) visuotactile sensor in JAX: simulation, rendering and learned prediction."""
 
 from sts_jax import dataset as dataset
+from sts_jax import environments as environments
 from sts_jax import evaluation as evaluation
 from sts_jax import geometry as geometry
 from sts_jax import mvae as mvae
