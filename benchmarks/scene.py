@@ -29,7 +29,6 @@ import matplotlib.pyplot as plt
 import mujoco
 import numpy as np
 import tyro
-from sts_jax.scene.geometry import body_of, visible
 
 import sts_jax as sts
 from benchmarks.instruments.timing import median_seconds
@@ -37,6 +36,7 @@ from experiments.shared.drawing import write_figure
 from sts_jax import geometry, objects, optics, scene, storage
 from sts_jax.objects.body import FACE_CLASSES, pad, size_class
 from sts_jax.physics.scene import mjx
+from sts_jax.scene.geometry import body_of, visible
 
 PADS = ("left", "right")
 ENVS = (1, 16, 256), (1, 16, 256, 4096)  # on a CPU, on a GPU
@@ -83,10 +83,10 @@ def build(sensor: sts.Sensor, body: objects.Body | None = None) -> mujoco.MjMode
     """A gripper with two sensors, cameras at the sensors' pinholes, the object, and two further bodies on the table."""
     spec = scene.gripper(sensor, body)
     for name, kind, size, y in (
-        ("ball", mujoco.mjtGeom.mjGEOM_SPHERE, [0.02, 0, 0], 0.1),
-        ("post", mujoco.mjtGeom.mjGEOM_CAPSULE, [0.02, 0.03, 0], -0.1),
+        ("ball", mujoco.mjtGeom.mjGEOM_SPHERE, [0.015, 0, 0], 0.1),
+        ("block", mujoco.mjtGeom.mjGEOM_BOX, [0.02, 0.02, 0.03], -0.1),
     ):
-        other = spec.worldbody.add_body(name=name, pos=[0, y, 0.02])
+        other = spec.worldbody.add_body(name=name, pos=[0, y, size[2] or size[0]])
         other.add_geom(name=name, type=kind, size=size, rgba=[0.2, 0.45, 0.7, 1])
     for name in PADS:
         tip = spec.site(f"{name}_tip")
@@ -288,7 +288,7 @@ def report(rows: list[Row]) -> str:
 def pictures() -> list[Path]:
     """Draw a grasp in both engines: the scene from outside, and both streams of both sensors at MOMENTS."""
     sensor, paths = sts.Sensor.sized(WIDTH), []
-    body = objects.make(jax.random.key(3), "mouse")
+    body = objects.make(jax.random.key(3), "bottle")
     model = build(sensor, body)
     view = scene.View(model, dict.fromkeys(PADS, sensor), bodies={"object": body})
     titles = ("scene", *(f"{name}, {stream}" for name in PADS for stream in ("visual", "tactile")))

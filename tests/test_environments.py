@@ -71,7 +71,8 @@ def test_a_firm_grasp_lifts_and_a_light_one_slips(gym_lift):
             observation, reward, terminated, truncated, info = gym_lift.step(action.astype(np.float32))
         assert not terminated
         assert not truncated
-        assert np.any(observation["pixels/left_tactile"] != untouched)
+        felt = np.any(observation["pixels/left_tactile"] != untouched)
+        assert felt == (info["touch"] > 0)
         weights = TASK.weights._asdict()
         assert reward == pytest.approx(sum(weights[name] * info[name] for name in weights), abs=1e-5)
         rises[friction, squeeze] = info["lift"]
