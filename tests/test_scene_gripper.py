@@ -9,22 +9,15 @@ import sts_jax as sts
 from sts_jax import scene
 from sts_jax.physics.forces import wrench
 
-SENSOR = sts.Sensor(gel=sts.tactile.Gel(size=(0.04, 0.04), thickness=0.0013, max_depth=0.0008))
+SENSOR = sts.Sensor.sized(0.04)
 G = 9.81
 CLOSED, LIFTED = 500, 1000  # steps of 1 ms
 
 
 def with_pads(spec):
-    """Compile the gripper with boxes at its tips, and return the model and the data of `home`."""
+    """Compile the gripper with a sensor at each tip, and return the model and the data of `home`."""
     for side in ("left", "right"):
-        site = spec.site(f"{side}_tip")
-        turn = np.zeros(9)
-        mujoco.mju_quat2Mat(turn, site.quat)
-        centre = site.pos - turn.reshape(3, 3)[:, 2] * SENSOR.gel.thickness / 2
-        size = [*np.asarray(SENSOR.gel.size) / 2, SENSOR.gel.thickness / 2]
-        site.parent.add_geom(
-            name=side, type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=centre, quat=site.quat, mass=0, friction=[0] * 3
-        )
+        scene.attach(spec, f"{side}_tip", SENSOR, name=side)
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key("home").id)
