@@ -114,8 +114,9 @@ def test_a_press_changes_only_the_imprint_of_its_body():
     touching = many(box, (BALL, PRESSED[1][0], NOTHING))
     both = many(box, pressed)
     changed = np.any(both.tactile != touching.tactile, axis=-1)
-    column = np.nonzero(changed)[1]
-    assert 0.02 < (column.min() / SIZE[1] - 0.5) * 0.15 < (column.max() / SIZE[1] - 0.5) * 0.15 < 0.04
+    y, x = (0.15 * ((place + 0.5) / SIZE[0] - 0.5) for place in np.nonzero(changed))
+    assert len(x) > 5
+    assert np.hypot(x - 0.03, y - 0.01).max() < 0.012  # m, the contact and the filter
     np.testing.assert_array_equal(both.pose[0], touching.pose[0])
     np.testing.assert_array_equal(touching.pose[1], PRESSED[1][0])
     # Deep in the gel, but without a force: it is seen, and leaves no imprint
@@ -180,7 +181,7 @@ def test_a_scene_of_large_and_small_faces_equals_embree():
     truth = embree(trimesh.util.concatenate(meshes), SENSOR.camera, SIZE)
     seen = np.isfinite(frame.depth)
     assert np.mean(seen != np.isfinite(truth)) < 0.005
-    inner = interior(truth, span=0.05) & seen
+    inner = interior(truth, span=0.3) & seen
     np.testing.assert_allclose(np.asarray(frame.depth)[inner], truth[inner], rtol=1e-4)
     assert inner.sum() > 500
 

@@ -24,6 +24,7 @@ from sts_jax import _cpu_reductions
 
 _SLACK = 1e-4  # pixels by which faces are enlarged, so that no pixel centre on a shared edge is missed
 _ROUNDING = 1e-6, 0.25  # the same for vertices far beyond the image: share of the largest coordinate, and at most this
+_OUTSIDE = 1e-6  # a point is outside a face if its negative weights sum to more than this
 _GROUP = 1024  # number of faces that are cut into runs at a time
 _RUN = 8  # largest number of pixels in a run
 _NOTHING = np.uint32(0xFFFFFFFF)  # key of a pixel without a face
@@ -290,8 +291,12 @@ def barycentrics(
     area = _cross(a, b, c)
     ok = area != 0
     area = jnp.where(ok, area, 1)
-    first = jnp.clip((b[0] * c[1] - c[0] * b[1]) / area, 0, 1)
-    second = jnp.clip((c[0] * a[1] - a[0] * c[1]) / area, 0, 1 - first)
+    first, second = (b[0] * c[1] - c[0] * b[1]) / area, (c[0] * a[1] - a[0] * c[1]) / area
+    total = jnp.maximum(first, 0) + jnp.maximum(second, 0) + jnp.maximum(1 - first - second, 0)
+    # The weights of a point outside are scaled. On a sliver, a cut at 1 would change the others too much.
+    scale = jnp.where(total > 1 + _OUTSIDE, 1 / total, 1)
+    first = jnp.clip(scale * first, 0, 1)
+    second = jnp.clip(scale * second, 0, 1 - first)
     return jnp.where(ok, first, 1), jnp.where(ok, second, 0), jnp.where(ok, 1 - first - second, 0)
 
 

@@ -126,7 +126,7 @@ def group(bodies: Sequence[Body], longest: float = LONGEST) -> Group:
     most = _power(max(map(len, rows)))
     sides = np.array([len(body.texture) for body in bodies])
     texels = len(bodies) if (sides == 1).all() else _power(int((sides**2).sum()))
-    parts_of_group = {
+    fields = {
         "vertices": joined([part.vertices for part in parts], num_vertices),
         "vertex_owner": np.concatenate([of_vertex, np.repeat(of_large, 4)]).astype(np.int32),
         "faces": faces.astype(np.int32),
@@ -136,13 +136,13 @@ def group(bodies: Sequence[Body], longest: float = LONGEST) -> Group:
         "large": (large_faces.astype(np.int32), _Attributes(*attributes(large, num_large))) if num_large else None,
         "texels": optics.Texels(
             joined([xp.asarray(body.texture).reshape(-1, 3) for body in bodies], texels),
-            (np.cumsum(sides**2) - sides**2).astype(np.int32),
-            sides.astype(np.int32),
+            xp.asarray(np.cumsum(sides**2) - sides**2, np.int32),
+            xp.asarray(sides, np.int32),
         ),
         "of_body": np.array([np.pad(r, (0, most - len(r)), constant_values=len(owner) - 1) for r in rows], np.int32),
     }
     with contextlib.nullcontext() if traced else jax.ensure_compile_time_eval():
-        return Group(**jax.tree.map(jnp.asarray, parts_of_group))
+        return Group(**jax.tree.map(jnp.asarray, fields))
 
 
 class _Part(NamedTuple):
