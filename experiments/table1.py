@@ -38,7 +38,7 @@ DEFAULT = Config(
     freefall=dataclasses.replace(COLLECTION, scenario=physics.Freefall()),
     inclined=dataclasses.replace(COLLECTION, scenario=physics.Inclined()),
     perturbed=dataclasses.replace(COLLECTION, scenario=physics.Perturbed(), categories=("bottle",)),
-    # All cells make the same number of steps with batches of the same size.
+    # All cells of a family make the same number of steps with batches of the same size.
     training=dataclasses.replace(common.TRAINING, steps=300, checkpoint_every=50),
     state_training=dataclasses.replace(common.STATE_TRAINING, steps=300, warmup=50, checkpoint_every=50),
 )
@@ -221,26 +221,24 @@ def draw_scene(
             touch, vision = (evaluation.predict(predictor, (name,), test, scenario) for name in ("tactile", "visual"))
             title = f"{scene.name}: {NAMES[model]}, each stream from the other one"
             figures.crossed_sheet(path(f"crossed-{model}"), test, touch, vision, some, **look, title=title)
-    few, time, curves = test.take(some), scene.data.trajectory["time"][test.trajectory[0]], {}
+    time, curves = scene.data.trajectory["time"][test.trajectory[0]], dict[str, evaluation.Curve]()
     for model in (model for model in SHEETS if model in step):
         stride = step[model].stride or 1
         times = np.arange(stride, len(time), stride)
         more = {"steps": len(times), "num_samples": COURSES if model in cells.STATE else 0}
-        rolled = evaluation.rollout(step[model], step[model].modalities, few, scenario, **more)
+        rolled = evaluation.rollout(step[model], step[model].modalities, test, scenario, **more)
         strip, title = scene.data.strip(int(test.trajectory[0])), f"{scene.name}: {NAMES[model]}, rolled out"
         figures.rollout_strip(
             path(f"rollout-{model}"), time, strip, rolled, 0, stride=stride, direct=ends.get(model), title=title
         )
-        truths = [scene.data.pairs(few.trajectory, frames=(0, int(t))) for t in times]
+        truths = [scene.data.pairs(test.trajectory, frames=(0, int(t))) for t in times]
         curves[f"{NAMES[model]}, rolled out"] = evaluation.error_curve(time[times], zip(rolled, truths, strict=True))
         copies = ((evaluation.Predicted(x.visual[:, 0], x.tactile[:, 0], x.pose[:, 0]), x) for x in truths)
         curves["copy of the input"] = evaluation.error_curve(time[times], copies)
         if model in ends:
-            curves[f"{NAMES[model]}, final-step"] = evaluation.error_curve(
-                time[-1:], [(evaluation.first(ends[model], len(few.object)), few)]
-            )
+            curves[f"{NAMES[model]}, final-step"] = evaluation.error_curve(time[-1:], [(ends[model], test)])
     if curves:
-        figures.error_curves(path("errors"), curves, few.object, title=f"{scene.name}: errors over time")
+        figures.error_curves(path("errors"), curves, test.object, title=f"{scene.name}: errors over time")
     return drawn
 
 
