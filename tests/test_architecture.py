@@ -13,11 +13,11 @@ ROOMS = [
     for name, paths, lines, budget in re.findall(r"^\| ([^|`]+) \| (`[^|]+) \| ([\d,]+) \| ([\d,]+) \|$", PAGE, re.M)
 ]
 TOTALS = {
-    "library without hardware": 21_430,
+    "library without hardware": 23_480,
     "hardware": 5_080,
-    "experiments": 5_170,
-    "benchmarks": 5_010,
-    "tests": 20_850,
+    "experiments": 5_880,
+    "benchmarks": 5_340,
+    "tests": 22_050,
 }
 
 
