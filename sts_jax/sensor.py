@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool
 from sts_jax._ranges import NOT_NEGATIVE, STATIC, limits
 from sts_jax.optics import Camera, Room
 from sts_jax.storage import DamagedFileError, digest, read_json, read_manifest, verify, write_json
-from sts_jax.tactile import Gel, Leds, Lights, Phong, Skin
+from sts_jax.tactile import Gel, Leds, Lights, Markers, Phong, Skin
 
 _LIGHTS: dict[str, type[Lights] | type[Leds]] = {"Lights": Lights, "Leds": Leds}  # by `lights.kind` in a file
 _LARGEST = float(np.finfo(np.float32).max)  # larger numbers become inf in float32
@@ -43,6 +43,7 @@ class Sensor:
     phong: Phong = dataclasses.field(default_factory=Phong)  # Reflectance of the skin's inner side.
     skin: Skin = dataclasses.field(default_factory=Skin)  # Smoothing of the imprint, and shadows on the skin.
     room: Room = dataclasses.field(default_factory=Room)  # External light, and the view of it through the skin.
+    markers: Markers | None = None  # Dots in the skin, which move when it shears. None: no dots, and no shear.
     # Images whose shorter side is below this number of pixels are sampled every half pixel and filtered. Our choice.
     fine_below: int = dataclasses.field(default=128, metadata=NOT_NEGATIVE | STATIC)
 
@@ -98,6 +99,7 @@ class Sensor:
 
         - The pinhole is at least `camera.near` below the gel's inner face, so that objects that press are drawn.
         - `gel.max_depth` is at most `gel.thickness`.
+        - `markers.radius` is at most half of `markers.pitch`.
         - Every light, internal or external, has one row in `colors` and one in `directions` or `positions`.
         - No direction is zero. Internal lights have z <= 0, below the opaque skin, and LEDs do not lie in the gel.
 
@@ -188,7 +190,8 @@ def _plain(value: Any) -> Any:
     """Convert a dataclass, an array or a number to the types of JSON."""
     if dataclasses.is_dataclass(value):
         kind = {"kind": type(value).__name__} if isinstance(value, Lights | Leds) else {}
-        return kind | {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+        return kind | {name: _plain(field) for name, field in fields.items() if field is not None}
     if isinstance(value, tuple):
         return [_plain(v) for v in value]
     if isinstance(value, int | float):
@@ -199,6 +202,10 @@ def _plain(value: Any) -> Any:
 
 def _typed(default: Any, value: Any, name: str, metadata: Mapping[str, Any] = MappingProxyType({})) -> Any:
     """Convert the values of a file to the types of the default value. Missing fields keep the default value."""
+    if name == "markers" and value is not None:
+        default = Markers()
+    if default is None and value is None:
+        return None
     if not dataclasses.is_dataclass(default):
         _require(_value_conditions(default, value, name, metadata))
         if isinstance(default, tuple):
@@ -228,15 +235,15 @@ def _require(conditions: Iterator[_Condition]) -> None:
 
 
 @functools.cache  # making its arrays takes a quarter of the time of a small image
-def _default(kind: type[Sensor], lights: type[Lights | Leds]) -> Sensor:
-    """The default sensor with one kind of lights. Its arrays are not traced."""
+def _default(kind: type[Sensor], lights: type[Lights | Leds], markers: bool) -> Sensor:
+    """The default sensor with one kind of lights, with or without markers. Its arrays are not traced."""
     with jax.ensure_compile_time_eval():
-        return dataclasses.replace(kind(), lights=lights())
+        return dataclasses.replace(kind(), lights=lights(), markers=Markers() if markers else None)
 
 
 def _default_of(sensor: Sensor) -> Sensor:
     kind: Any = type(sensor)  # mypy takes a class without hashable instances for unhashable
-    return _default(kind, Leds if isinstance(sensor.lights, Leds) else Lights)
+    return _default(kind, Leds if isinstance(sensor.lights, Leds) else Lights, sensor.markers is not None)
 
 
 def _conditions(sensor: Sensor) -> Iterator[_Condition]:
@@ -259,6 +266,12 @@ def _conditions(sensor: Sensor) -> Iterator[_Condition]:
         max_depth <= thickness,
         lambda: f"field gel.max_depth is {max_depth:g}, but it must be <= gel.thickness = {thickness:g}.",
     )
+    if sensor.markers is not None:
+        radius, pitch = _array(sensor.markers.radius), _array(sensor.markers.pitch)
+        yield (
+            2 * radius <= _ROUNDED * pitch,
+            lambda: f"field markers.radius is {radius:g}, but it must be <= markers.pitch / 2 = {pitch / 2:g}.",
+        )
     yield from _row_conditions("lights", vars(sensor.lights))
     yield from _row_conditions("room", vars(sensor.room))
     leds = isinstance(sensor.lights, Leds)
@@ -287,6 +300,8 @@ def _field_conditions(
     default: Any, value: Any, name: str, metadata: Mapping[str, Any] = MappingProxyType({})
 ) -> Iterator[_Condition]:
     """Yield the conditions that every number is finite and in range. Raise a ValueError for a wrong type or shape."""
+    if default is None:
+        return
     if not dataclasses.is_dataclass(default):
         static = isinstance(default, int) or (isinstance(default, tuple) and isinstance(default[0], int))
         if isinstance(default, tuple) and not isinstance(value, tuple):

@@ -42,13 +42,15 @@ def test_a_loaded_sensor_equals_the_saved_one(tmp_path, lights):
     sensor = Sensor()
     gel = dataclasses.replace(sensor.gel, stiffness=5e5, cells=(100, 120))
     skin = tactile.Skin(coupling=0.0003, shadow_steps=12, shadow_reach=0.01, penumbra=0.3)
-    sensor = dataclasses.replace(sensor, gel=gel, fine_below=0, lights=lights, skin=skin)
+    markers = tactile.Markers(pitch=0.004) if lights is LEDS else None
+    sensor = dataclasses.replace(sensor, gel=gel, fine_below=0, lights=lights, skin=skin, markers=markers)
     sensor.save(tmp_path / "sensor.json")
     loaded = Sensor.load(tmp_path / "sensor.json")
     assert jax.tree.structure(loaded) == jax.tree.structure(sensor)
     for wrote, read in zip(jax.tree.leaves(sensor), jax.tree.leaves(loaded), strict=True):
         assert np.array_equal(wrote, read)
     values = json.loads((tmp_path / "sensor.json").read_text())
+    assert ("markers" in values) == (markers is not None)
     assert values["skin"] == {"coupling": 0.0003, "shadow_steps": 12, "shadow_reach": 0.01, "penumbra": 0.3}
 
 
@@ -64,6 +66,13 @@ INVALID = [
     ("lights.positions", [[0.1, 0, -0.02]]),  # unknown to Lights
     ("lights.directions", [[0, 0, 0]] * 4),
 ]
+MARKERS_FILE = {"markers": {"pitch": 0.004, "radius": 0.002}}
+INVALID_MARKERS = [
+    ("markers.radius", 0.0021),  # dots that overlap
+    ("markers.pitch", [0.004]),
+    ("markers.size", 0.1),
+    ("markers", 3),
+]
 INVALID_LEDS = [
     ("lights.positions", [[0.0, 0, -0.004]]),  # in the gel, over the pad
     ("lights.positions", [[0.075, 0.075, 0.0]]),  # at its corner
@@ -73,7 +82,11 @@ INVALID_LEDS = [
 
 @pytest.mark.parametrize(
     ("start", "field", "value"),
-    [*((Sensor().constants(), *row) for row in INVALID), *((LEDS_FILE, *row) for row in INVALID_LEDS)],
+    [
+        *((Sensor().constants(), *row) for row in INVALID),
+        *((LEDS_FILE, *row) for row in INVALID_LEDS),
+        *((MARKERS_FILE, *row) for row in INVALID_MARKERS),
+    ],
 )
 def test_an_invalid_or_unknown_field_in_a_file_raises_an_error_that_names_it(tmp_path, start, field, value):
     path, values = tmp_path / "sensor.json", copy.deepcopy(start)
@@ -97,7 +110,7 @@ def test_a_missing_field_in_a_file_takes_its_default(tmp_path, field):
 
 
 def limited_fields():
-    sensor = Sensor(lights=tactile.Leds())
+    sensor = Sensor(lights=tactile.Leds(), markers=tactile.Markers())
     parts = [part.name for part in dataclasses.fields(sensor) if part.name != "fine_below"]
     beyond = {"above": (">", 0), "at_least": (">=", -1), "below": ("<", 1), "at_most": ("<=", 1)}
     for part in parts:
@@ -109,7 +122,7 @@ def limited_fields():
 
 @pytest.mark.parametrize(("part", "name", "number", "sign"), sorted(limited_fields()))
 def test_every_range_is_checked(tmp_path, part, name, number, sign):
-    sensor = Sensor(lights=tactile.Leds())
+    sensor = Sensor(lights=tactile.Leds(), markers=tactile.Markers())
     field = getattr(getattr(sensor, part), name)
     wrong = jax.tree.map(lambda x: jnp.full_like(x, number) if isinstance(x, jax.Array) else type(x)(number), field)
     with pytest.raises(ValueError, match=rf"(?s)field {part}\.{name} is .*, but it must be {sign} "):

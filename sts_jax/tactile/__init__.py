@@ -11,6 +11,10 @@ from sts_jax.tactile.gel import cell_centres as cell_centres
 from sts_jax.tactile.gel import indent as indent
 from sts_jax.tactile.gel import settle as settle
 from sts_jax.tactile.normals import surface_normals as surface_normals
+from sts_jax.tactile.shear import Markers as Markers
+from sts_jax.tactile.shear import Shear as Shear
+from sts_jax.tactile.shear import dots as dots
+from sts_jax.tactile.shear import shear as shear
 from sts_jax.tactile.skin import Leds as Leds
 from sts_jax.tactile.skin import Lights as Lights
 from sts_jax.tactile.skin import Phong as Phong

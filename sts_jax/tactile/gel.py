@@ -199,7 +199,7 @@ def _newton(
         length = _plane(u, x, y) - height
         weight = (length > 0) + _BOTTOM * (length > limit)
         gradient = _moments(pushed(length), x, y) - target
-        s = _sums(weight, x, y, 2)
+        s = moment_sums(weight, x, y, 2)
         full = jnp.stack([s[0, 0], s[1, 0], s[0, 1], s[1, 0], s[2, 0], s[1, 1], s[0, 1], s[1, 1], s[0, 2]])
         return gradient, full.reshape(3, 3) + (1e-6 + 1e-5 * s[0, 0]) * jnp.eye(3)
 
@@ -230,17 +230,17 @@ def _newton(
 
     # One more step, through which the derivatives pass. All earlier values are constants for them.
     gradient, hessian = slopes(u, height, x, y, target)
-    return jnp.clip(u - _solve(jax.lax.stop_gradient(hessian), gradient, jnp.abs(u) >= near_bound), -bound, bound)
+    return jnp.clip(u - solve_3x3(jax.lax.stop_gradient(hessian), gradient, jnp.abs(u) >= near_bound), -bound, bound)
 
 
 def _newton_step(state: _Descent, bound: Float[Array, "3"], near_bound: Float[Array, "3"]) -> Float[Array, "3"]:
     """Newton step that keeps all unknowns within their bounds. Unknowns that would leave them are held fixed."""
     u, gradient = state.u, state.gradient
     held = ((u >= near_bound) & (gradient < 0)) | ((u <= -near_bound) & (gradient > 0))
-    step = -_solve(state.hessian, gradient, held)
+    step = -solve_3x3(state.hessian, gradient, held)
     # Also hold an unknown at its bound if the step of the other unknowns would move it beyond.
     held |= (jnp.abs(u) >= near_bound) & (jnp.abs(u + step) > bound)
-    step = -_solve(state.hessian, gradient, held)
+    step = -solve_3x3(state.hessian, gradient, held)
     room = (bound - u * jnp.sign(step)) / jnp.where(step == 0, 1, jnp.abs(step))
     return step * jnp.clip(jnp.min(jnp.where(step == 0, 1, room)), 0, 1)
 
@@ -249,7 +249,9 @@ def _plane(u: Float[Array, "3"], x: Float[Array, "c"], y: Float[Array, "r"]) -> 
     return (u[0] + u[1] * y)[:, None] + (u[2] * x)[None, :]
 
 
-def _sums(value: Float[Array, "r c"], x: Float[Array, "c"], y: Float[Array, "r"], degree: int) -> Float[Array, "k k"]:
+def moment_sums(
+    value: Float[Array, "r c"], x: Float[Array, "c"], y: Float[Array, "r"], degree: int
+) -> Float[Array, "k k"]:
     """Matrix of the sums of `value y^i x^j`, at row i and column j, for powers up to `degree`."""
     # One vector product for each power of y, because products of narrow matrices are several times slower on a CPU.
     rows = [jnp.sum(value, axis=0), *(y**power @ value for power in range(1, degree + 1))]
@@ -257,11 +259,11 @@ def _sums(value: Float[Array, "r c"], x: Float[Array, "c"], y: Float[Array, "r"]
 
 
 def _moments(value: Float[Array, "r c"], x: Float[Array, "c"], y: Float[Array, "r"]) -> Float[Array, "3"]:
-    sums = _sums(value, x, y, 1)
+    sums = moment_sums(value, x, y, 1)
     return jnp.stack([sums[0, 0], sums[1, 0], sums[0, 1]])
 
 
-def _solve(matrix: Float[Array, "3 3"], vector: Float[Array, "3"], held: Bool[Array, "3"]) -> Float[Array, "3"]:
+def solve_3x3(matrix: Float[Array, "3 3"], vector: Float[Array, "3"], held: Bool[Array, "3"]) -> Float[Array, "3"]:
     """Solve a linear system for the unknowns that are not held, by Cramer's rule. The held unknowns are 0."""
     matrix = jnp.where(held[:, None] | held[None, :], jnp.eye(3), matrix)
     vector = jnp.where(held, 0, vector)
