@@ -43,6 +43,8 @@ class Frame:
     pressure: Float[Array, "*n r c"]
     window: Float[Array, "*n 4"]  # Part of the gel's outer face that the images show: left, top, width, height (m).
     body: Int[Array, "*n h w"]  # Index of the body that each pixel shows, -1 where there is none.
+    # Displacement of the skin along x and y under the tangential load, on the gel's grid (m). None without markers.
+    shear: Float[Array, "*n r c 2"] | None = None
 
     def __repr__(self) -> str:
         if not hasattr(self.depth, "shape") or len(self.depth.shape) < 2:  # JAX also builds trees of other leaves
@@ -120,9 +122,12 @@ def sense(
         # Hulls and interior are not drawn. Without them, bodies of one size class share a program.
         body = dataclasses.replace(body, hulls=jnp.zeros((1, 1, 3)), interior=jnp.zeros((1, 3, 3)))
         # Two programs, so that a new resolution compiles only the second one.
-        resting = equilibrium.balance(sensor.gel, sound, body.vertices, body.faces, body.two_sided, pose, wrench)
+        resting = equilibrium.balance(
+            sensor.gel, sound, body.vertices, body.faces, body.two_sided, pose, wrench, sensor.markers
+        )
         images = drawing.draw(sensor, body, resting, resolution=resolution, crop=crop, moving_edges=moving_edges)
-        drawn = images._asdict() | {"pose": resting.shown, "balanced": resting.balanced, "pressure": resting.pressure}
+        drawn = images._asdict() | {"pose": resting.shown, "balanced": resting.balanced}
+        drawn |= {"pressure": resting.pressure, "shear": resting.shear}
     else:
         # A face that reaches from before `near` into the view beyond the gel has a longer edge.
         camera = Camera() if is_traced(camera) else camera
@@ -222,7 +227,11 @@ def expose(sensor: Sensor, frame: Frame, light: Real[ArrayLike, ""]) -> Float[Ar
 @in_32_bits
 @checked
 def touch(
-    sensor: Sensor, imprint: Float[ArrayLike, "h w"], window: Float[ArrayLike, "4"] | None = None
+    sensor: Sensor,
+    imprint: Float[ArrayLike, "h w"],
+    window: Float[ArrayLike, "4"] | None = None,
+    *,
+    shear: Float[ArrayLike, "r c 2"] | None = None,
 ) -> Float[Array, "h w 3"]:
     """Render the tactile image of a given imprint, such as the result of another contact model.
 
@@ -231,6 +240,7 @@ def touch(
             contact. The depth is clipped to [0, `Gel.thickness`], and NaN counts as 0.
         window: Part of the gel's outer face that the image shows: left, top, width, height (m). None selects the
             largest centred part of the camera's view with the aspect ratio of `imprint`.
+        shear: Displacement of the skin along x and y on the gel's grid (m), which moves the dots of `Sensor.markers`.
 
     Returns:
         Image in [0, 1]. If its shorter side has at least `Sensor.fine_below` pixels, it equals `Frame.tactile` for the
@@ -244,4 +254,10 @@ def touch(
     if not isinstance(has_area, jax.core.Tracer) and not has_area:
         raise ValueError(f"window must be finite left, top, width > 0, height > 0 (m), got {window}")
     sound &= has_area
-    return drawing.touch(sensor, jnp.where(sound, imprint, 0), jnp.where(sound, window, full))
+    if shear is not None and (sensor.markers is None or np.shape(shear) != (*sensor.gel.cells, 2)):
+        raise ValueError(
+            f"shear has the shape {np.shape(shear)}, but it must have the shape {(*sensor.gel.cells, 2)} of the gel's "
+            "grid, and the sensor must have markers: use Sensor(markers=tactile.Markers())"
+        )
+    shear = None if shear is None else jnp.asarray(shear, float)
+    return drawing.touch(sensor, jnp.where(sound, imprint, 0), jnp.where(sound, window, full), shear)

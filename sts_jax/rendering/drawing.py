@@ -13,7 +13,7 @@ from sts_jax.objects.body import Body
 from sts_jax.rendering.corners import Corners, weighted
 from sts_jax.rendering.edges import with_moving_edges
 from sts_jax.rendering.equilibrium import Resting
-from sts_jax.rendering.lit_skin import lit_skin
+from sts_jax.rendering.lit_skin import lit_skin, passing, smoothed
 from sts_jax.rendering.loop import looped
 from sts_jax.rendering.tiles import lines, planes, where_active
 from sts_jax.sensor import Sensor
@@ -80,17 +80,21 @@ def draw(
 
 
 @jax.jit
-def touch(sensor: Sensor, imprint: Float[Array, "h w"], window: Float[Array, "4"]) -> Float[Array, "h w 3"]:
+def touch(
+    sensor: Sensor, imprint: Float[Array, "h w"], window: Float[Array, "4"], shear: Float[Array, "r c 2"] | None
+) -> Float[Array, "h w 3"]:
     """Draw the tactile image of an imprint (m) in a window (m). See `sts_jax.touch`."""
     rows, columns = imprint.shape
     pitch = window[2:] / jnp.array([columns, rows], jnp.float32)
     seen = jnp.concatenate([window[:2] - pitch, window[2:] + 2 * pitch])
     slopes = lines(optics.rays(sensor.camera, seen, (rows + 2, columns + 2)))
     imprint = jnp.where(imprint > 0, jnp.minimum(imprint, sensor.gel.thickness), 0)
-    lit = lit_skin(sensor, jnp.pad(imprint, 1, mode="edge"), seen, pitch, slopes)
+    imprint = smoothed(sensor, jnp.pad(imprint, 1, mode="edge"), pitch)
+    lit = lit_skin(sensor, imprint, seen, slopes)
+    ink = passing(sensor, imprint, pitch, slopes, shear)
     x, y = (slope * sensor.camera.distance for slope in slopes)
     walls = _pad_and_walls(sensor, x[:, 1:-1], y[1:-1])[1]
-    return jnp.stack([jnp.clip(channel * walls, 0, 1) for channel in lit], axis=-1)
+    return jnp.stack([jnp.clip(channel * walls * ink, 0, 1) for channel in lit], axis=-1)
 
 
 def images_of(
@@ -107,13 +111,15 @@ def images_of(
     stride = 2 if min(resolution) < sensor.fine_below else 1
     samples = _sample(sensor, surface, resting, window, resolution, stride)
     depth, light = _see(sensor, surface, resting, samples)
-    visual = _pixels([channel[1:-1, 1:-1] for channel in light], stride)
-    visual = [jnp.clip(optics.to_srgb(channel), 0, 1) for channel in visual]
     owner = jnp.zeros((), jnp.int32) if surface.owner is None else surface.owner[jnp.maximum(samples.winner, 0)]
     pressing = resting.pressing if surface.owner is None else resting.pressing[owner]
     imprint = _imprint(sensor, pressing, samples, depth, moving_edges)
-    lit = lit_skin(sensor, imprint, samples.seen, samples.pitch, samples.slopes)
-    lit = _pixels([channel * samples.walls[1:-1, 1:-1] for channel in lit], stride)
+    imprint = smoothed(sensor, imprint, samples.pitch)
+    lit = lit_skin(sensor, imprint, samples.seen, samples.slopes)
+    ink = passing(sensor, imprint, samples.pitch, samples.slopes, resting.shear)
+    visual = _pixels([channel[1:-1, 1:-1] * ink for channel in light], stride)
+    visual = [jnp.clip(optics.to_srgb(channel), 0, 1) for channel in visual]
+    lit = _pixels([channel * samples.walls[1:-1, 1:-1] * ink for channel in lit], stride)
     lit = [jnp.clip(channel, 0, 1) for channel in lit]
     body = jnp.where(samples.winner >= 0, owner, -1)
     depth, body = (image[1:-1, 1:-1] if stride == 1 else image[2:-1:2, 2:-1:2] for image in (depth, body))

@@ -26,6 +26,7 @@ class Resting(NamedTuple):
     pressing: Bool[Array, "*n"]  # True if it is present, and Fz > 0 or no wrench is given
     balanced: Bool[Array, "*n"]  # True if the gel balances the wrench within its limits
     pressure: Float[Array, "r c"]  # pressure on the gel's grid (Pa)
+    shear: Float[Array, "r c 2"] | None  # displacement of the skin (m), None for a sensor without markers
 
 
 def _balance(
@@ -36,6 +37,7 @@ def _balance(
     two_sided: Bool[Array, ""],
     pose: Float[Array, "7"],
     wrench: Float[Array, "6"] | None,
+    markers: tactile.Markers | None = None,
 ) -> Resting:
     """Let an object sink and tilt until the gel balances the wrench. None keeps the object in the given pose.
 
@@ -61,6 +63,7 @@ def _balance(
         pressing=pressing,
         balanced=contact.balanced & finite,
         pressure=contact.pressure,
+        shear=sheared(gel, markers, contact.pressure, wrench),
     )
 
 
@@ -78,6 +81,18 @@ def safe(
         wrench = jnp.where(finite, wrench, 0)
     pose = jnp.where(finite, pose, jnp.array([0.0, 0, -1, 1, 0, 0, 0]))
     return finite, jnp.concatenate([pose[:3], geometry.normalize(pose[3:])]), wrench
+
+
+def sheared(
+    gel: tactile.Gel,
+    markers: tactile.Markers | None,
+    pressure: Float[Array, "r c"],
+    wrench: Float[Array, "6"] | None,
+) -> Float[Array, "r c 2"] | None:
+    """Displacement of the skin under one object (m), 0 if no wrench is given."""
+    if markers is None:
+        return None
+    return jnp.zeros((*gel.cells, 2)) if wrench is None else tactile.shear(gel, markers, pressure, wrench).displacement
 
 
 def underside(

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 from sts_jax import geometry, optics, tactile
 from sts_jax.objects.body import Body, is_traced
 from sts_jax.rendering.drawing import Surface, images_of
-from sts_jax.rendering.equilibrium import Resting, moved, safe, underside
+from sts_jax.rendering.equilibrium import Resting, moved, safe, sheared, underside
 from sts_jax.rendering.loop import looped
 from sts_jax.sensor import Sensor
 
@@ -68,6 +68,7 @@ class Drawn(NamedTuple):
     pressure: Float[Array, "r c"]
     window: Float[Array, "4"]
     body: Int[Array, "h w"]
+    shear: Float[Array, "r c 2"] | None
 
 
 class _Placed(NamedTuple):
@@ -193,6 +194,7 @@ def draw_group(
         pressure=resting.pressure,
         window=images.window,
         body=images.body,
+        shear=resting.shear,
     )
 
 
@@ -219,7 +221,9 @@ def _balanced(
     else:
         pressing = touching = present & (wrenches[:, 2] > 0)
     each = looped(_contact), (None, None, None, None, 0, 0, 0, 0)
-    contact = jax.vmap(*each)(gel, group, points, ahead, group.of_body, jnp.arange(number), touching, wrenches)
+    contact, shear = jax.vmap(*each)(
+        sensor, group, points, ahead, group.of_body, jnp.arange(number), touching, wrenches
+    )
     balanced_poses = jax.vmap(moved)(safe_poses, contact)
     placed = jax.lax.cond(jnp.any(touching), lambda: _placed(group, balanced_poses, present, lowest), lambda: placed)
     return (
@@ -232,6 +236,7 @@ def _balanced(
             pressing=pressing,
             balanced=contact.balanced & finite,
             pressure=jnp.sum(contact.pressure, axis=0),
+            shear=None if shear is None else jnp.sum(shear, axis=0),
         ),
         placed.shares,
     )
@@ -241,7 +246,7 @@ _balance = jax.jit(looped(_balanced))
 
 
 def _contact(
-    gel: tactile.Gel,
+    sensor: Sensor,
     group: Group,
     points: Float[Array, "v 3"],
     ahead: Bool[Array, "v"],
@@ -249,19 +254,22 @@ def _contact(
     index: Int[Array, ""],
     touching: Bool[Array, ""],
     wrench: Float[Array, "6"] | None,
-) -> tactile.Equilibrium:
-    """Equilibrium of one of the bodies. Without contact, nothing is computed on a CPU."""
+) -> tuple[tactile.Equilibrium, Float[Array, "r c 2"] | None]:
+    """Equilibrium of one of the bodies, and shear of the skin. Without contact, nothing is computed on a CPU."""
+    gel, markers = sensor.gel, sensor.markers
 
-    def press() -> tactile.Equilibrium:
+    def press() -> tuple[tactile.Equilibrium, Float[Array, "r c 2"] | None]:
         mine = ahead & (group.vertex_owner == index)
         # All other vertices are put at the body's highest point, so that extents need no mask.
         highest = points[jnp.argmax(jnp.where(mine, points[:, 2], -jnp.inf))]
         here = jnp.where(mine[:, None], points, highest[None, :])
         heights = underside(gel, group.faces[chosen], group.two_sided[chosen], here, mine)[0]
-        return tactile.indent(gel, heights) if wrench is None else tactile.settle(gel, heights, wrench)
+        contact = tactile.indent(gel, heights) if wrench is None else tactile.settle(gel, heights, wrench)
+        return contact, sheared(gel, markers, contact.pressure, wrench)
 
-    def leave() -> tactile.Equilibrium:
-        return tactile.Equilibrium(jnp.float32(0), jnp.zeros(2), jnp.zeros(gel.cells), jnp.bool_(True))
+    def leave() -> tuple[tactile.Equilibrium, Float[Array, "r c 2"] | None]:
+        nothing = tactile.Equilibrium(jnp.float32(0), jnp.zeros(2), jnp.zeros(gel.cells), jnp.bool_(True))
+        return nothing, sheared(gel, markers, nothing.pressure, None)
 
     return jax.lax.cond(touching, press, leave)
 

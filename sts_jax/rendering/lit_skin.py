@@ -12,20 +12,23 @@ from sts_jax.sensor import Sensor
 _UNTOUCHED = 2e-6
 
 
+def smoothed(sensor: Sensor, imprint: Float[Array, "a b"], pitch: Float[Array, "2"]) -> Float[Array, "a b"]:
+    """Depth of the skin (m) from that of the imprint. `pitch` is the distance between rays on the gel's face (m)."""
+    coupled = sensor.skin.coupling > 0
+    return jax.lax.cond(coupled, tactile.couple, lambda *given: given[0], imprint, sensor.skin.coupling, pitch)
+
+
 def lit_skin(
     sensor: Sensor,
     imprint: Float[Array, "a b"],
     window: Float[Array, "4"],
-    pitch: Float[Array, "2"],
     slopes: tuple[Float[Array, "1 b"], Float[Array, "a 1"]],
 ) -> list[Float[Array, "h w"]]:
-    """Red, green and blue light of the skin for a grid of camera rays, not clipped, from the depth of the imprint (m).
+    """Red, green and blue light of the skin for a grid of camera rays, not clipped, from the depth of the skin (m).
 
-    `window` is the part of the gel's face that the grid covers (m), `pitch` the distance between rays there (m), and
-    `slopes` are x / depth and y / depth. The outermost rows and columns, which have no normals, are dropped.
+    `window` is the part of the gel's face that the grid covers (m), and `slopes` are x / depth and y / depth. The
+    outermost rows and columns, which have no normals, are dropped.
     """
-    coupled = sensor.skin.coupling > 0
-    imprint = jax.lax.cond(coupled, tactile.couple, lambda *given: given[0], imprint, sensor.skin.coupling, pitch)
     shares = tactile.shadows(sensor.skin, sensor.lights, imprint, window) if sensor.skin.shadow_steps else ()
     x, y = slopes[0][:, 1:-1] * sensor.camera.distance, slopes[1][1:-1] * sensor.camera.distance
     flat = jnp.stack(jnp.broadcast_arrays(x, y, jnp.zeros(())), axis=-1)
@@ -34,6 +37,22 @@ def lit_skin(
     )
     pressed = _near(imprint > _UNTOUCHED * sensor.gel.thickness)
     return where_active(_skin, pressed, sensor, (*slopes, imprint, *shares), planes(untouched), ring=1)
+
+
+def passing(
+    sensor: Sensor,
+    imprint: Float[Array, "a b"],
+    pitch: Float[Array, "2"],
+    slopes: tuple[Float[Array, "1 b"], Float[Array, "a 1"]],
+    shear: Float[Array, "r c 2"] | None,
+) -> Float[Array, "h w"] | float:
+    """Share of the light that the dots in the skin let through, without the outermost rows and columns."""
+    if sensor.markers is None:
+        return 1.0
+    depth = (sensor.camera.distance - imprint)[1:-1, 1:-1]
+    shear = jnp.zeros((*sensor.gel.cells, 2)) if shear is None else shear
+    x, y = slopes[0][:, 1:-1] * depth, slopes[1][1:-1] * depth
+    return tactile.dots(sensor.gel, sensor.markers, shear, x, y, pitch[0])
 
 
 def _skin(sensor: Sensor, images: tuple[Array, ...]) -> list[Float[Array, "h w *tiles"]]:
