@@ -80,11 +80,12 @@ def check_arrays(kind: type, arrays: Mapping[str, Any], infinite: Collection[str
     """Raise a ValueError unless arrays have the names, shapes and types of the annotations of a class.
 
     Args:
-        kind: A dataclass or NamedTuple of arrays. The field `fill` of its field `hidden` has the name `hidden/fill`.
+        kind: A dataclass or NamedTuple of arrays. The field `fill` of its field `hidden` has the name `hidden/fill`. An
+            array whose annotation includes None may be missing.
         arrays: The arrays, with any leading axes, all the same. Their values must be finite.
         infinite: Names of arrays whose values may be infinite.
     """
-    hints = dict(_annotations(kind))
+    hints = {name: hint for name, hint, optional in _annotations(kind) if name in arrays or not optional}
     if different := sorted(hints.keys() ^ arrays.keys()):
         raise ValueError(f"array {different[0]} is {'missing' if different[0] in hints else 'unknown'}")
     with jaxtyped("context"):
@@ -99,9 +100,11 @@ def check_arrays(kind: type, arrays: Mapping[str, Any], infinite: Collection[str
                 raise ValueError(f"array {name} has values that are not finite")
 
 
-def _annotations(kind: type, prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _annotations(kind: type, prefix: str = "") -> Iterator[tuple[str, Any, bool]]:
+    """Names and annotations of the arrays, and whether they may be None."""
     for name, hint in typing.get_type_hints(kind).items():
-        if hasattr(hint, "dim_str"):
-            yield prefix + name, hint
+        array, *rest = typing.get_args(hint) or (hint,)
+        if hasattr(array, "dim_str"):
+            yield prefix + name, array, rest == [type(None)]
         else:
             yield from _annotations(hint, f"{prefix}{name}/")

@@ -77,7 +77,7 @@ def sense(
 
     With a wrench, the object sinks and tilts until the gel balances Fz, Mx and My (`tactile.settle`). Without one, it
     stays in the given pose. An object that is wholly inside the sensor (z < 0) is not drawn: z = -1 m gives images of
-    the empty sensor.
+    the empty sensor. With `Sensor.markers`, Fx, Fy and Mz shear the skin and move its dots (`tactile.shear`).
 
     Several bodies are a list of any bodies, such as an object, the opposite finger and a table. The nearest surface of
     all is drawn. Each body sinks and tilts under its own wrench. With Fz <= 0 it stays in its pose and leaves no

@@ -46,7 +46,12 @@ TRAJECTORY = sts.physics.Trajectory(
 )
 
 
-@pytest.mark.parametrize("thing", [FRAME, BODY, TRAJECTORY], ids=["frame", "body", "trajectory"])
+SHEARED = dataclasses.replace(FRAME, shear=jnp.ones((5, 5, 2)))
+
+
+@pytest.mark.parametrize(
+    "thing", [FRAME, SHEARED, BODY, TRAJECTORY], ids=["frame", "sheared frame", "body", "trajectory"]
+)
 def test_a_loaded_npz_equals_the_saved_object(tmp_path, thing):
     sts.save(tmp_path / "thing.npz", thing)
     same(sts.load(tmp_path / "thing.npz"), thing)
@@ -57,6 +62,7 @@ def test_a_loaded_npz_equals_the_saved_object(tmp_path, thing):
     [
         (FRAME, "visual", lambda x: x[1:], "array tactile is float32 of shape"),
         (FRAME, "tactile", lambda x: x * np.nan, "array tactile has values that are not finite"),
+        (SHEARED, "shear", lambda x: x[..., :1], "array shear is"),
         (FRAME, "segmentation", lambda x: x + 0.5, "array segmentation is float64"),
         (BODY, "hulls", lambda x: x + np.inf, "array hulls has values"),
         (BODY, "faces", lambda x: x + 10**6, "faces has indices from"),

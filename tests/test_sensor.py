@@ -166,19 +166,21 @@ def test_flipped_bits_of_a_saved_sensor_are_found_and_edited_files_are_accepted_
 
 @pytest.mark.parametrize("width", [0.0375, 0.04, 0.6])
 def test_a_similar_body_under_the_same_force_gives_the_same_images_on_a_similar_sensor(width):
-    like = Sensor(lights=tactile.Leds(), skin=tactile.Skin(coupling=0.0007, shadow_steps=4))
+    like = Sensor(lights=tactile.Leds(), skin=tactile.Skin(coupling=0.0007, shadow_steps=4), markers=tactile.Markers())
 
     def frame(sensor, scale):
         body = ball()
         body = dataclasses.replace(body, vertices=body.vertices * scale, hulls=body.hulls * scale)
         placement = at(0.012 * scale, -0.02 * scale, 0.0305 * scale, (0.9, 0, 0, 0.4))
-        return sense(sensor, body, placement, weight(1, 0.012 * scale, -0.02 * scale), resolution=(32, 32))
+        wrench = weight(1, 0.012 * scale, -0.02 * scale) + jnp.array([-0.5, 0.3, 0, 0, 0, -0.006 * scale])
+        return sense(sensor, body, placement, wrench, resolution=(32, 32))
 
     scale, first = width / 0.15, frame(like, 1)
     second = frame(Sensor.sized(width, like=like), scale)
     assert first.balanced
     assert second.balanced
     assert float(first.pressure.max()) > 1000
+    assert float(first.shear.max()) > 0.0005
     assert np.array_equal(first.segmentation, second.segmentation)
     pairs = {
         "visual": (first.visual, second.visual),
@@ -186,6 +188,7 @@ def test_a_similar_body_under_the_same_force_gives_the_same_images_on_a_similar_
         "depth": (first.depth, second.depth / scale),
         "pressure": (first.pressure / 1e4, second.pressure / 1e4 * scale**2),
         "position": (first.pose[:3], second.pose[:3] / scale),
+        "shear": (first.shear, second.shear / scale),
         "window": (first.window, second.window / scale),
     }
     exact = width == 0.0375  # a power of two
