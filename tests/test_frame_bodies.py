@@ -116,7 +116,7 @@ def test_a_press_changes_only_the_imprint_of_its_body():
     changed = np.any(both.tactile != touching.tactile, axis=-1)
     y, x = (0.15 * ((place + 0.5) / SIZE[0] - 0.5) for place in np.nonzero(changed))
     assert len(x) > 5
-    assert np.hypot(x - 0.03, y - 0.01).max() < 0.012  # m, the contact and the filter
+    assert np.hypot(x - 0.03, y - 0.01).max() < 0.02  # m, the contact of 9 mm and the filter
     np.testing.assert_array_equal(both.pose[0], touching.pose[0])
     np.testing.assert_array_equal(touching.pose[1], PRESSED[1][0])
     # Deep in the gel, but without a force: it is seen, and leaves no imprint
