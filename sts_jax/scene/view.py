@@ -28,13 +28,19 @@ _OVERHANG = 1.02  # a pad may be larger than its finger by this factor
 _GEOM = mujoco.mjtObj.mjOBJ_GEOM
 
 
+class _Contacts(NamedTuple):
+    """Where the s contacts of a pad that MuJoCo's sensors store stand in the data."""
+
+    places: Int[np.ndarray, "s 17"]  # indices into `sensordata`
+    bodies: Int[np.ndarray, "s"]  # body on the other side of each contact
+
+
 class _Pad(NamedTuple):
     """One sensor of the scene, with k bodies that it can see. Numbers of bodies are MuJoCo's."""
 
     sensor: Sensor  # with `camera.near` at the gel's inner face
     site: int  # number of the site that is the sensor frame
-    places: Int[np.ndarray, "s 17"]  # indices into `sensordata`, one row for each stored contact
-    touched: Int[np.ndarray, "s"]  # body of each contact
+    contacts: _Contacts
     bodies: Int[np.ndarray, "k"]  # bodies that it can see
     group: Group  # their geometry
     names: Int[np.ndarray, "k"]  # their places in `View.bodies`
@@ -77,58 +83,32 @@ class View:
                 0), or all its geoms if it has no visual ones.
             hide: Names of bodies and geoms that are not drawn.
         """
+        if not sensors:
+            raise ValueError("sensors is empty: name each pad and its sensor, as in {'left': sensor}")
         pads = {name: _pad_geom(model, name, sensor) for name, sensor in sensors.items()}
         for name in pads:
             _check_finger(model, name, pads)
-        if not pads:
-            raise ValueError("sensors is empty: name each pad and its sensor, as in {'left': sensor}")
-        names = {_body_name(model, body): body for body in range(model.nbody)}
-        _check_names(model, names, bodies, hide, pads)
-        shown = np.union1d(visible(model, groups), list(pads.values()))
-        hidden = [
-            geom for geom in shown if {model.geom(geom).name, _body_name(model, model.geom_bodyid[geom])} & {*hide}
-        ]
-        shown = np.setdiff1d(shown, hidden)
-        replaced = {names[name]: body for name, body in bodies.items() if name not in hide}
-        drawn = sorted({*model.geom_bodyid[shown].tolist(), *replaced})
-        made: dict[tuple[int, ...], Body] = {}
-
-        def body(owner: int, without: int) -> Body | None:
-            geoms = tuple(shown[(model.geom_bodyid[shown] == owner) & (shown != without)].tolist())
-            if owner in replaced:
-                return replaced[owner]
-            if geoms and geoms not in made:
-                made[geoms] = body_of(model, geoms)
-            return made.get(geoms)
-
+        seen = _seen(model, pads, bodies, groups, hide)
+        drawn = sorted(set().union(*seen.values()))
         self._shapes = {
             "xpos": (model.nbody, 3),
             "xquat": (model.nbody, 4),
             "site_xpos": (model.nsite, 3),
             "sensordata": (model.nsensordata,),
         }
-        self._names = {number: name for name, number in names.items()}
-        self.bodies: tuple[str, ...] = tuple(self._names[number] for number in drawn)
-        self._pads: dict[str, _Pad] = {}
-        for name, pad in pads.items():
-            carrier, sensor = model.geom_bodyid[pad], sensors[name]
-            # Behind the gel is the sensor's housing, where nothing is seen.
-            near = float(sensor.camera.distance) - float(sensor.gel.thickness)
-            sensor = dataclasses.replace(sensor, camera=dataclasses.replace(sensor.camera, near=near))
-            seen = {owner: body(owner, pad) for owner in drawn if owner != carrier or carrier == 0}
-            present = {owner: one for owner, one in seen.items() if one is not None}
-            if not present:
-                raise ValueError(f"the sensor {name!r} can see no body: add one to the model, or hide fewer")
-            places, touched = _contacts(model, pad)
-            self._pads[name] = _Pad(
-                sensor=sensor,
+        self._names = [_body_name(model, body) for body in range(model.nbody)]
+        self.bodies: tuple[str, ...] = tuple(self._names[owner] for owner in drawn)
+        self._pads = {
+            name: _Pad(
+                sensor=_without_housing(sensor),
                 site=model.site(name).id,
-                places=places,
-                touched=touched,
-                bodies=np.array(list(present)),
-                group=group(list(present.values())),
-                names=np.searchsorted(drawn, list(present)).astype(np.int32),
+                contacts=_contacts(model, pads[name]),
+                bodies=np.array(list(seen[name])),
+                group=group(list(seen[name].values())),
+                names=np.searchsorted(drawn, list(seen[name])).astype(np.int32),
             )
+            for name, sensor in sensors.items()
+        }
 
     @in_32_bits
     @checked
@@ -159,7 +139,7 @@ class View:
         """Force (N) and moment (N m) that each sensor exerts on each body that can touch it, in the sensor frame."""
         arrays, wrenches = self._read(data), {}
         for name, pad in self._pads.items():
-            bodies = np.unique(pad.touched)
+            bodies = np.unique(pad.contacts.bodies)
             rows = zip(bodies.tolist(), _felt(arrays, pad, bodies), strict=True)
             wrenches[name] = {self._names[body]: row for body, row in rows}
         return wrenches
@@ -201,7 +181,8 @@ def _poses(arrays: _Arrays, site: Int[Array, ""], bodies: Int[Array, "k"]) -> Fl
 
 def _felt(arrays: _Arrays, pad: _Pad, bodies: Int[np.ndarray, "k"]) -> Float[Array, "k 6"]:
     """Wrenches that a pad exerts on bodies, in the sensor frame."""
-    return _wrenches(arrays, pad.site, pad.places, pad.touched[None, :] == bodies[:, None], pad.sensor.gel.thickness)
+    counts = pad.contacts.bodies[None, :] == bodies[:, None]
+    return _wrenches(arrays, pad.site, pad.contacts.places, counts, pad.sensor.gel.thickness)
 
 
 @jax.jit
@@ -219,7 +200,7 @@ def _wrenches(
     point = (point - arrays.site_xpos[site]) @ turn
     # A normal points from one geom to the other, but MJX 3.17 swaps the two for some pairs of types. Out of the pad is
     # away from a point deep inside it.
-    inside = jnp.array([0.0, 0.0, -0.75]) * thickness
+    inside = jnp.array([0.0, 0.0, -0.9]) * thickness
     outward = jnp.sign(jnp.sum((point - inside) * frame[:, 0], axis=1))
     force, torque = (jnp.einsum("s,si,sij->sj", outward, part, frame) for part in (force, torque))
     return counts.astype(jnp.float32) @ jnp.concatenate([force, jnp.cross(point, force) + torque], axis=1)
@@ -297,14 +278,50 @@ def _sensors(model: mujoco.MjModel, pad: int) -> Iterator[tuple[int, int]]:
             yield (other if pad == one else one), int(sensor)
 
 
-def _contacts(model: mujoco.MjModel, pad: int) -> tuple[Int[np.ndarray, "s 17"], Int[np.ndarray, "s"]]:
-    """Indices into the sensor data of each stored contact of a pad, and the body of each contact."""
+def _contacts(model: mujoco.MjModel, pad: int) -> _Contacts:
     places, bodies = [np.zeros((0, _CONTACT), int)], [np.zeros(0, int)]
     for other, sensor in dict(_sensors(model, pad)).items():
         start, length = model.sensor_adr[sensor], model.sensor_dim[sensor]
         places.append((start + np.arange(length)).reshape(-1, _CONTACT))
         bodies.append(np.full(length // _CONTACT, model.geom_bodyid[other]))
-    return np.concatenate(places), np.concatenate(bodies)
+    return _Contacts(np.concatenate(places), np.concatenate(bodies))
+
+
+def _without_housing(sensor: Sensor) -> Sensor:
+    """A sensor whose camera begins to see at the gel's inner face. Below it is the housing, where nothing is seen."""
+    near = float(sensor.camera.distance) - float(sensor.gel.thickness)
+    return dataclasses.replace(sensor, camera=dataclasses.replace(sensor.camera, near=near))
+
+
+def _seen(
+    model: mujoco.MjModel,
+    pads: Mapping[str, int],
+    bodies: Mapping[str, Body],
+    groups: Collection[int] | None,
+    hide: Collection[str],
+) -> dict[str, dict[int, Body]]:
+    """What each pad can see: the geometry of each body by its number."""
+    numbers = {_body_name(model, body): body for body in range(model.nbody)}
+    _check_names(model, numbers, bodies, hide, pads)
+    owner = model.geom_bodyid
+    shown = np.union1d(visible(model, groups), list(pads.values()))
+    shown = np.array([g for g in shown if not {model.geom(g).name, _body_name(model, owner[g])} & {*hide}], int)
+    replaced = {numbers[name]: body for name, body in bodies.items() if name not in hide}
+    made: dict[tuple[int, ...], Body] = {}
+
+    def geometry_of(number: int, pad: int) -> Body | None:
+        geoms = tuple(shown[(owner[shown] == number) & (shown != pad)].tolist())
+        if geoms and number not in replaced and geoms not in made:
+            made[geoms] = body_of(model, geoms)
+        return replaced.get(number, made.get(geoms))
+
+    seen: dict[str, dict[int, Body]] = {}
+    for name, pad in pads.items():
+        others = [n for n in sorted({*owner[shown].tolist(), *replaced}) if n != owner[pad] or n == 0]
+        seen[name] = {n: body for n in others if (body := geometry_of(n, pad)) is not None}
+        if not seen[name]:
+            raise ValueError(f"the sensor {name!r} can see no body: add one to the model, or hide fewer")
+    return seen
 
 
 def _check_names(
