@@ -37,7 +37,7 @@ def forward(model: mujoco.MjModel) -> mujoco.MjData:
 
 
 OBJECTS = {  # position, rotation vector, geom, the same shape by trimesh
-    "ball": ((-0.03, -0.02, 0.0195), (0, 0, 0), 'type="sphere" size=".02"', trimesh.creation.icosphere(5, 0.02)),
+    "ball": ((-0.03, -0.02, 0.0198), (0, 0, 0), 'type="sphere" size=".02"', trimesh.creation.icosphere(5, 0.02)),
     "rod": (
         (0.03, -0.03, 0.04),
         (0.5, 0.3, 0.2),
