@@ -147,7 +147,7 @@ def merged(
             pose = jnp.concatenate([jnp.asarray(data.xpos[owner]), jnp.asarray(data.xquat[owner])])
             parts.append(moved(one, pose))
     counts = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    size = size_class(int(counts[-1]), FACE_CLASSES)
+    size = size_class(max(int(counts[-1]), sum(len(part.faces) for part in parts)), FACE_CLASSES)
     return dataclasses.replace(
         parts[0],
         vertices=jnp.asarray(pad(np.concatenate([part.vertices for part in parts]), size, 0.0)),
