@@ -63,9 +63,10 @@ def body_of(model: mujoco.MjModel, geoms: Iterable[int] | Int[np.ndarray, "k"]) 
             "the mesh, leave the body out with `hide`, or give it a simpler shape with `bodies`"
         )
     turns = [Rotation.from_quat(model.geom_quat[geom], scalar_first=True) for geom in geoms]
-    vertices, faces, normals, colors = [], [], [], []
+    vertices: list[np.ndarray] = []
+    faces, normals, colors = [], [], []
     for geom, turn, one in zip(geoms, turns, surfaces, strict=True):
-        faces.append(one.faces + sum(map(len, vertices)))
+        faces.append(one.faces + sum(len(part) for part in vertices))
         vertices.append(turn.apply(one.vertices) + model.geom_pos[geom])
         normals.append(_normals(vertices[-1], one.faces))
         colors.append(np.broadcast_to(linear(rgba(model, geom)[:3]), (len(one.faces), 3, 3)))
@@ -113,19 +114,20 @@ def surface(model: mujoco.MjModel, geom: int) -> Surface:
     if kind == _TYPE.mjGEOM_CYLINDER:
         turned = _revolved(np.array([[0.0, -1], [1, -1], [1, 1], [0, 1]]), np.array([1.0, 0, 0, 0]), _sides(size[0]))
         caps = np.ptp(turned.vertices[turned.faces][..., 2], axis=1) == 0
+        assert turned.uv is not None
         turned.uv[caps] = 0.5 + 0.5 * turned.vertices[turned.faces[caps]][..., :2]
         return turned._replace(vertices=turned.vertices * size[[0, 0, 1]])
-    sides = _sides(size.max())
-    angle = np.linspace(-np.pi / 2, np.pi / 2, sides // 2 + 1)
+    around = _sides(size.max() if kind == _TYPE.mjGEOM_ELLIPSOID else size[0])
+    angle = np.linspace(-np.pi / 2, np.pi / 2, around // 2 + 1)
     profile, v = np.stack([np.cos(angle), np.sin(angle)], axis=1), np.linspace(1, 0, len(angle))
     profile[[0, -1], 0] = 0
     if kind == _TYPE.mjGEOM_CAPSULE:
-        quarter, straight = sides // 4, size[1] / size[0]
+        quarter, straight = around // 4, size[1] / size[0]
         move = np.repeat([-straight, straight], quarter + 1)
         profile = np.concatenate([profile[: quarter + 1], profile[quarter:]]) + np.stack([0 * move, move], axis=1)
         v = np.tile(np.linspace(1, 0, quarter + 1), 2)
         v[quarter + 1] = 0
-    turned = _revolved(profile, v, sides)
+    turned = _revolved(profile, v, around)
     return turned._replace(vertices=turned.vertices * (size if kind == _TYPE.mjGEOM_ELLIPSOID else size[0]))
 
 
@@ -234,8 +236,8 @@ def _texture(
         # Cells of one texture do not repeat.
         pairs = [_unrolled(image, uv) for image, uv in zip(images, uvs, strict=True)]
         images, uvs = [image for image, _ in pairs], [uv for _, uv in pairs]
-    joined, texture = combined(images, uvs)
-    return joined, np.ones((1, 1, 3)) if texture is None else texture
+    joined, packed = combined(images, uvs)
+    return joined, np.ones((1, 1, 3)) if packed is None else packed
 
 
 def _texture_of(model: mujoco.MjModel, geom: int) -> int:
