@@ -47,7 +47,7 @@ def executed(name: str) -> tuple[list[np.ndarray], str]:
             "a_gripper_that_feels",
             5,
             r"(?s)right presses on the object with (5\.9|6\.0)\d N.*carry 1\.4\d\d N"
-            r".*grip 2\.0 N: the object slides by -?0\.\d mm.*grip 1\.2 N: the object slides by [1-9]",
+            r".*grip 6\.0 N: the object comes down by -?0\.\d mm.*grip 3\.0 N: the object comes down by [1-9]",
         ),
     ],
 )
