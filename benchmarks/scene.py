@@ -162,14 +162,14 @@ def merged(
 def moved(body: objects.Body, pose: jax.Array) -> objects.Body:
     """The used faces of a body in another frame."""
     used = np.flatnonzero(np.any(np.asarray(body.faces) != np.asarray(body.faces)[:, :1], axis=1))
-    turn = np.asarray(geometry.quat_to_matrix(pose[3:]))
+    turn = geometry.quat_to_matrix(pose[3:])
     return dataclasses.replace(
         body,
-        vertices=np.asarray(geometry.transform(pose, body.vertices))[: int(np.max(body.faces)) + 1],
-        faces=np.asarray(body.faces)[used],
-        normals=np.asarray(body.normals)[used] @ turn.T,
-        colors=np.asarray(body.colors)[used],
-        uv=np.asarray(body.uv)[used],
+        vertices=geometry.transform(pose, body.vertices)[: int(np.max(body.faces)) + 1],
+        faces=body.faces[used],
+        normals=body.normals[used] @ turn.T,
+        colors=body.colors[used],
+        uv=body.uv[used],
     )
 
 
@@ -218,7 +218,9 @@ class Work(NamedTuple):
 
     def draw(self) -> None:
         """Draw an image from each sensor's camera with MuJoCo's renderer, if there is one."""
-        for name in PADS if self.renderer else ():
+        if self.renderer is None:
+            return
+        for name in PADS:
             self.renderer.update_scene(self.held, camera=name)
             self.renderer.render()
 

@@ -100,7 +100,7 @@ def probabilities(
         if stale(workdir, f"{name}, seed {seed}", inputs) is not None:
             with Bar() as bar:
                 shown = functools.partial(bar, f"{name}, seed {seed}", total=config.training.steps)
-                found = judging.judged(config.training, data, parts, name, seed, lambda done, say=shown: say(done=done))
+                found = judging.judged(config.training, data, parts, name, seed, shown)
             storage.write_arrays(file, {"probability": found, "held": data["held"][parts["test"]]})
             record(workdir, f"{name}, seed {seed}", inputs, [file])
         rows.append(storage.read_arrays(file, f"delete {file}")["probability"])

@@ -116,8 +116,8 @@ class Grasp(NamedTuple):
 def draw(lifts: Lifts, number: int, points: np.ndarray) -> tuple[Hidden, Grasp]:
     """Draw the lifts of an object, whose hull has the given points (m)."""
     rng, n = np.random.default_rng([lifts.seed, number]), lifts.num_per_object
-    mass = ConvexHull(points).volume * np.exp(rng.uniform(*np.log(lifts.density), n))
-    hidden = Hidden(mass, rng.uniform(*lifts.friction, n), np.exp(rng.uniform(*np.log(lifts.grip), n)))
+    mass = ConvexHull(points).volume * np.exp(rng.uniform(*np.log(lifts.density), size=n))
+    hidden = Hidden(mass, rng.uniform(*lifts.friction, n), np.exp(rng.uniform(*np.log(lifts.grip), size=n)))
     yaw = _narrow(points) + rng.normal(size=n) * np.deg2rad(lifts.lean)
     turned = np.stack([Rotation.from_rotvec([0, 0, angle]).apply(points) for angle in yaw])
     middle = (turned.min(axis=1) + turned.max(axis=1)) / 2
@@ -213,7 +213,7 @@ def lift_object(lifts: Lifts, number: int) -> dict[str, np.ndarray]:
         return {
             **{stream: image.astype(np.uint8) for stream, image in images.items()},
             "wrench": np.stack([np.asarray(wrench[side]["object"]) for side in SIDES]),
-            "opening": np.float32(data.qpos[1] + data.qpos[2]),
+            "opening": np.asarray(data.qpos[1] + data.qpos[2], np.float32),
         }
 
     with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:

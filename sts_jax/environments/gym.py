@@ -63,7 +63,7 @@ class GymLift(gymnasium.Env[Observation, np.ndarray]):
         self.action_space = spaces.Box(-1, 1, (len(ACTIONS),), np.float32)
         image = spaces.Box(0, 255, (*self.task.resolution, 3), np.uint8)
         images = {f"pixels/{pad}_{name}": image for pad in PADS for name in STREAMS}
-        self.observation_space = spaces.Dict({"state": spaces.Box(-LARGEST, LARGEST, (6,), np.float32), **images})
+        self.observation_space: spaces.Dict = spaces.Dict({"state": spaces.Box(-LARGEST, LARGEST, (6,), np.float32), **images})
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict]:
         """Begin an episode with the open gripper around the object, whose pose and friction are drawn."""
@@ -106,4 +106,4 @@ class GymLift(gymnasium.Env[Observation, np.ndarray]):
         return {"state": np.asarray(state), **images}
 
 
-gymnasium.register("sts_jax/Lift-v0", entry_point=GymLift, max_episode_steps=EPISODE)
+gymnasium.register("sts_jax/Lift-v0", entry_point="sts_jax.environments.gym:GymLift", max_episode_steps=EPISODE)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from sts_jax._checked import in_32_bits
 from sts_jax.environments.task import ACTIONS, PADS, STREAMS, Reward, Start, Task, judge, placed, proprioception, target
@@ -99,7 +99,7 @@ class Lift:
             metrics=state.metrics | terms._asdict(),
         )
 
-    def _with(self, friction: Float[Array, ""]) -> mjx.Model:
+    def _with(self, friction: Float[ArrayLike, ""]) -> mjx.Model:
         values = self._mjx_model.geom_friction
         return self._mjx_model.replace(geom_friction=values.at[self.setting.geoms, 0].set(friction))
 

@@ -165,7 +165,8 @@ def judge(
     Returns:
         Reward, its terms, and whether the episode ends because the object is lost or a value is not finite.
     """
-    rise = place[2] - start
+    x, y, z = (jnp.asarray(place)[k] for k in range(3))
+    rise = z - start
     terms = Reward(
         touch=jnp.clip(jnp.min(forces) / task.touch, 0, 1),
         lift=jnp.clip(rise / task.height, 0, 1),
@@ -174,6 +175,6 @@ def judge(
     )
     sound = jnp.all(jnp.isfinite(qpos)) & jnp.all(jnp.isfinite(place)) & jnp.all(jnp.isfinite(forces))
     terms = Reward(*(jnp.where(sound, term, 0) for term in terms))
-    lost = jnp.hypot(place[0], place[1]) > task.reach
+    lost = jnp.hypot(x, y) > task.reach
     reward = sum(weight * term for weight, term in zip(task.weights, terms, strict=True))
     return jnp.asarray(reward), terms, lost | ~sound
