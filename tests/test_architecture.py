@@ -13,11 +13,11 @@ ROOMS = [
     for name, paths, lines, budget in re.findall(r"^\| ([^|`]+) \| (`[^|]+) \| ([\d,]+) \| ([\d,]+) \|$", PAGE, re.M)
 ]
 TOTALS = {
-    "library without hardware": 23_480,
+    "library without hardware": 23_830,
     "hardware": 5_080,
     "experiments": 5_880,
-    "benchmarks": 5_340,
-    "tests": 22_050,
+    "benchmarks": 5_350,
+    "tests": 22_730,
 }
 
 

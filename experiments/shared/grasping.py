@@ -113,11 +113,15 @@ class Grasp(NamedTuple):
     height: np.ndarray  # of the sensors' middle above the table (m)
 
 
+def _log_uniform(rng: np.random.Generator, limits: tuple[float, float], n: int) -> np.ndarray:
+    return np.exp(rng.uniform(np.log(limits[0]), np.log(limits[1]), n))
+
+
 def draw(lifts: Lifts, number: int, points: np.ndarray) -> tuple[Hidden, Grasp]:
     """Draw the lifts of an object, whose hull has the given points (m)."""
     rng, n = np.random.default_rng([lifts.seed, number]), lifts.num_per_object
-    mass = ConvexHull(points).volume * np.exp(rng.uniform(*np.log(lifts.density), size=n))
-    hidden = Hidden(mass, rng.uniform(*lifts.friction, n), np.exp(rng.uniform(*np.log(lifts.grip), size=n)))
+    density, grip = (_log_uniform(rng, limits, n) for limits in (lifts.density, lifts.grip))
+    hidden = Hidden(ConvexHull(points).volume * density, rng.uniform(*lifts.friction, n), grip)
     yaw = _narrow(points) + rng.normal(size=n) * np.deg2rad(lifts.lean)
     turned = np.stack([Rotation.from_rotvec([0, 0, angle]).apply(points) for angle in yaw])
     middle = (turned.min(axis=1) + turned.max(axis=1)) / 2

@@ -65,7 +65,9 @@ class Judge(nnx.Module):
     def __init__(self, shape: tuple[int, ...], dropout: float, rngs: nnx.Rngs) -> None:
         width = WIDTHS[-1]
         self.sees = len(shape) == 4
-        self.features = Eye((shape[1], shape[2], shape[3]), rngs) if self.sees else nnx.Linear(shape[0], 2 * width, rngs=rngs)
+        self.features = (
+            Eye((shape[1], shape[2], shape[3]), rngs) if self.sees else nnx.Linear(shape[0], 2 * width, rngs=rngs)
+        )
         self.dropout = nnx.Dropout(dropout if self.sees else 0.0, rngs=rngs)
         self.hidden = nnx.Linear(2 * width, width, rngs=rngs)
         self.out = nnx.Linear(width, 1, rngs=rngs)

@@ -63,7 +63,9 @@ class GymLift(gymnasium.Env[Observation, np.ndarray]):
         self.action_space = spaces.Box(-1, 1, (len(ACTIONS),), np.float32)
         image = spaces.Box(0, 255, (*self.task.resolution, 3), np.uint8)
         images = {f"pixels/{pad}_{name}": image for pad in PADS for name in STREAMS}
-        self.observation_space: spaces.Dict = spaces.Dict({"state": spaces.Box(-LARGEST, LARGEST, (6,), np.float32), **images})
+        # Gymnasium annotates the space by the type of its values.
+        space: Any = spaces.Dict({"state": spaces.Box(-LARGEST, LARGEST, (6,), np.float32), **images})
+        self.observation_space = space
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict]:
         """Begin an episode with the open gripper around the object, whose pose and friction are drawn."""

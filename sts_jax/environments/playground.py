@@ -26,8 +26,8 @@ class State:
 
     data: Any  # `mjx.Data`
     obs: dict[str, Array]  # Observation, see `Lift`.
-    reward: Float[Array, ""]  # Reward of the last action.
-    done: Float[Array, ""]  # 1 if the object is lost, else 0.
+    reward: Float[Array, "*n"]  # Reward of the last action.
+    done: Float[Array, "*n"]  # 1 if the object is lost, else 0.
     metrics: dict[str, Array]  # Terms of the reward, without their weights.
     info: dict[str, Any]  # The object's coefficient of friction, and the entries of wrappers.
 

@@ -157,7 +157,8 @@ class View:
         if isinstance(data, mujoco.MjData) and not data.xquat.any():
             raise ValueError("data has no positions yet: call mujoco.mj_forward(model, data) before")
         xmat = jnp.asarray(data.site_xmat, jnp.float32).reshape(-1, 3, 3)
-        return _Arrays(*(jnp.asarray(getattr(data, name), jnp.float32) for name in self._shapes), xmat)
+        arrays = {name: jnp.asarray(getattr(data, name), jnp.float32) for name in self._shapes}
+        return _Arrays(**arrays, site_xmat=xmat)
 
 
 class _Arrays(NamedTuple):
