@@ -25,10 +25,10 @@ class State:
     """State of an environment, with the fields of Playground's `State`."""
 
     data: Any  # `mjx.Data`
-    obs: dict[str, Array]  # Observation, see `Lift`.
-    reward: Float[Array, "*n"]  # Reward of the last action.
-    done: Float[Array, "*n"]  # 1 if the object is lost, else 0.
-    metrics: dict[str, Array]  # Terms of the reward, without their weights.
+    obs: dict[str, Any]  # Observation, see `Lift`.
+    reward: Any  # Reward of the last action.
+    done: Any  # 1 if the object is lost, else 0.
+    metrics: dict[str, Any]  # Terms of the reward, without their weights.
     info: dict[str, Any]  # The object's coefficient of friction, and the entries of wrappers.
 
     def replace(self, **changes: Any) -> "State":
