@@ -63,7 +63,7 @@ def test_fingers_press_with_the_grip_force_and_carry_the_weight(name):
         mujoco.mj_step(model, data)
         moment[:] = [wrench(model, data, side, f"{side}_tip")[:3] for side in ("left", "right")]
     np.testing.assert_allclose(forces[..., 2].mean(axis=0), 6, rtol=0.01)
-    np.testing.assert_allclose(forces[..., 2], 6, rtol=0.05)
+    np.testing.assert_allclose(forces[..., 2], 6, rtol=0.1)
     np.testing.assert_allclose(-forces[..., 1].sum(axis=1), 0.12 * G, rtol=0.02)
     assert data.qpos[0] - 0.022 == pytest.approx(0.04, abs=2e-3)
     np.testing.assert_allclose(data.qpos[1], data.qpos[2], atol=2e-5)
