@@ -47,7 +47,7 @@ OBJECTS = {  # position, rotation vector, geom, the same shape by trimesh
     "can": (
         (-0.03, 0.03, 0.05),
         (1.1, -0.4, 0.3),
-        'type="cylinder" size=".015 .02"',
+        'type="cylinder" size=".015 .02" contype="0" conaffinity="0"',  # MJX has no collision with the pad
         trimesh.creation.cylinder(0.015, 0.04, sections=96),
     ),
     "block": (
@@ -59,7 +59,7 @@ OBJECTS = {  # position, rotation vector, geom, the same shape by trimesh
     "egg": (
         (0.0, 0.0, 0.06),
         (0.2, 0.9, 0.1),
-        'type="ellipsoid" size=".01 .02 .015"',
+        'type="ellipsoid" size=".01 .02 .015" contype="0" conaffinity="0"',
         trimesh.creation.icosphere(5, 1.0).apply_scale((0.01, 0.02, 0.015)),
     ),
     "sheet": ((0.0, 0.0, 0.1), (np.pi, 0, 0), 'type="plane" size=".2 .2 .1"', None),
