@@ -10,3 +10,5 @@ if sys.argv[0] == "-m":  # Python looks for the command, and has not imported it
     from experiments.shared import interrupts
 
     interrupts.end_at_once()
+    # Without this, importing MuJoCo starts a process that looks for GLFW and prints a traceback at Ctrl-C.
+    os.environ.setdefault("MUJOCO_GL", "disable")
