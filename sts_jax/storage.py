@@ -9,6 +9,7 @@ import io
 import json
 import os
 import platform
+import secrets
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -39,7 +40,8 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     Args:
         write: Function that writes the content to the path of a temporary file, which is then renamed to `path`.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    # A process on another host that shares the folder may have the same number.
+    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write(temporary)
@@ -243,16 +245,19 @@ def checksums(folder: Path, names: Iterable[str]) -> dict[str, str]:
     return {name: sha256(folder / name) for name in names}
 
 
-def write_manifest(folder: Path, files: Mapping[str, str], facts: Mapping[str, Any] | None = None) -> Manifest:
+def write_manifest(
+    folder: Path, files: Mapping[str, str], facts: Mapping[str, Any] | None = None, *, name: str = MANIFEST
+) -> Manifest:
     """Write `manifest.json`, after all other files of the folder. The file also has a checksum of its own content.
 
     Args:
         files: SHA-256 by relative path, from `checksums`. For files that have not changed, pass the values of the
             previous manifest, so that damage since then is not hidden.
         facts: Further JSON values.
+        name: Name of a manifest of only some files of the folder.
     """
     content = {"files": dict(files), "facts": dict(facts or {})}
-    write_json(folder / MANIFEST, {**content, "checksum": digest(content)})
+    write_json(folder / name, {**content, "checksum": digest(content)})
     return Manifest(**content)
 
 
@@ -265,14 +270,15 @@ class _Content:
     checksum: str
 
 
-def read_manifest(folder: Path, remedy: str, kind: type[Any] | None = None) -> Manifest | None:
+def read_manifest(folder: Path, remedy: str, kind: type[Any] | None = None, *, name: str = MANIFEST) -> Manifest | None:
     """Read `manifest.json`, without comparing the files. None if the folder has no such file.
 
     Args:
         remedy: Text at the end of the error message, with the remedy for a damaged, edited or exchanged manifest.
         kind: Dataclass with the facts that a folder of this kind has. None: any facts.
+        name: Name of a manifest of only some files of the folder.
     """
-    path = folder / MANIFEST
+    path = folder / name
     if not path.exists():
         return None
     try:
@@ -290,59 +296,71 @@ def read_manifest(folder: Path, remedy: str, kind: type[Any] | None = None) -> M
     return Manifest(content.files, content.facts)
 
 
-def verify(folder: Path, manifest: Manifest, remedy: str, names: Iterable[str] | None = None) -> None:
+def verify(
+    folder: Path, manifest: Manifest, remedy: str, names: Iterable[str] | None = None, *, listing: str = MANIFEST
+) -> None:
     """Compare files of a folder with their checksums in its manifest. The first that differs is named.
 
     Args:
         remedy: Text at the end of the error message.
         names: Relative paths of the files to compare. None: all files of the manifest.
+        listing: Name of the manifest, for messages.
     """
     for name in manifest.files if names is None else names:
         path = folder / name
         if name not in manifest.files:
-            raise DamagedFileError(f"{path} is not listed in {MANIFEST}: {remedy}.")
+            raise DamagedFileError(f"{path} is not listed in {listing}: {remedy}.")
         try:
             actual = sha256(path)
         except FileNotFoundError:
-            raise DamagedFileError(f"{path} is missing, but {MANIFEST} lists it: {remedy}.") from None
+            raise DamagedFileError(f"{path} is missing, but {listing} lists it: {remedy}.") from None
         except OSError as error:
             raise DamagedFileError(f"{path} cannot be read ({error}): {remedy}.") from error
         if actual != manifest.files[name]:
             raise DamagedFileError(
-                f"{path} is not the file that {MANIFEST} lists (its SHA-256 differs). It was edited, exchanged or "
+                f"{path} is not the file that {listing} lists (its SHA-256 differs). It was edited, exchanged or "
                 f"damaged: {remedy}."
             )
 
 
-OWNER = ".lock-owner"  # file in a locked folder with the number of the process that locked it
-
-
 @contextlib.contextmanager
-def lock(folder: Path, *, finished: bool = False) -> Iterator[None]:
+def lock(folder: Path, *, finished: bool = False, part: tuple[int, int] = (0, 1)) -> Iterator[None]:
     """Lock a folder for this process until the `with` block or the process ends. A missing folder is created.
 
-    What killed processes have left of unfinished writes is deleted.
+    What killed processes have left of unfinished writes is deleted, unless several processes work in the folder.
 
     Args:
         finished: True if the results in the folder may be complete, so that nothing needs to be written. A folder on a
             read-only file system is then not locked.
+        part: Index of this process and number of the processes that work in the folder at the same time. Each locks
+            the folder for its own index only.
 
     Raises:
-        LockedError: The folder is already locked, by another process or by this one.
+        LockedError: The folder is already locked for this index or another number of processes, also by this process.
     """
-    owner, held = folder / OWNER, filelock.FileLock(folder / ".lock", timeout=0)
+    index, count = part
+    name = ".lock" if count == 1 else f".lock-{index}-of-{count}"
+    held = filelock.FileLock(folder / name, timeout=0)
     this = f"process {os.getpid()} on {platform.node()}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         held.acquire()
-        owner.write_text(this)
-    except filelock.Timeout:
+        _owner(folder / name).write_text(this)
+        for path in _other_locks(folder, name, count):
+            with filelock.FileLock(path, timeout=0):
+                _unlock(path, keep=path.name == ".lock")
+    except filelock.Timeout as error:
+        taken = Path(error.lock_file)
+        if taken.name != name:
+            _unlock(folder / name, keep=count == 1)
+        held.release()
         holder = "another process"
         with contextlib.suppress(OSError):  # the holder may not have written it yet, or may have just finished
-            holder = owner.read_text(errors="replace") or holder
+            holder = _owner(taken).read_text(errors="replace") or holder
+        what = "" if count == 1 and taken.name == name else f", which locked it with {taken.name}"
         own = holder == this
         remedy = "close what uses the folder in this process" if own else "wait until that process has finished"
-        raise LockedError(f"{folder} is in use by {holder}: {remedy}, or choose another folder.") from None
+        raise LockedError(f"{folder} is in use by {holder}{what}: {remedy}, or choose another folder.") from None
     except OSError as error:
         held.release()
         if finished and error.errno in _FORBIDDEN and folder.is_dir():
@@ -350,23 +368,46 @@ def lock(folder: Path, *, finished: bool = False) -> Iterator[None]:
             return
         raise OSError(f"cannot create or write to {folder}: {error}. Choose a folder you can write to.") from error
     try:
-        _delete_partial(folder)
+        if count == 1:
+            delete_partial(folder)
         yield
     finally:
         with contextlib.suppress(OSError):  # the folder may have been deleted meanwhile
-            owner.unlink(missing_ok=True)
+            _unlock(folder / name, keep=count == 1)
         held.release()
 
 
-def _delete_partial(folder: Path) -> None:
-    """Delete unfinished files and folders, except in folders below that have a lock of their own."""
+def _owner(path: Path) -> Path:
+    """File with the number of the process that holds a lock."""
+    return path.with_name(f"{path.name}-owner")
+
+
+def _unlock(path: Path, *, keep: bool) -> None:
+    """Delete the files of a lock that this process holds. The lock of a whole folder may be kept."""
+    _owner(path).unlink(missing_ok=True)
+    if not keep:
+        path.unlink(missing_ok=True)
+
+
+def _other_locks(folder: Path, name: str, count: int) -> list[Path]:
+    """The locks of a folder that exclude this one: those for another number of processes."""
+    paths = [path for path in folder.glob(".lock*") if not path.name.endswith("-owner")]
+    return [path for path in paths if path.name != name and not path.name.endswith(f"-of-{count}")]
+
+
+def delete_partial(folder: Path, prefix: str = "") -> None:
+    """Delete unfinished files and folders, except in folders below that have a lock of their own.
+
+    Args:
+        prefix: Beginning of the names to delete.
+    """
     with contextlib.suppress(OSError):  # a folder of another user
         for path in list(folder.iterdir()):
             is_folder = path.is_dir() and not path.is_symlink()
-            if path.name.startswith(".") and path.suffix == ".partial":
+            if path.name.startswith(f".{prefix}") and path.suffix == ".partial":
                 shutil.rmtree(path, ignore_errors=True) if is_folder else path.unlink(missing_ok=True)
-            elif is_folder and not (path / ".lock").exists():
-                _delete_partial(path)
+            elif is_folder and not any(path.glob(".lock*")):
+                delete_partial(path, prefix)
 
 
 def flush_folder(folder: Path) -> None:

@@ -127,21 +127,20 @@ def bytes_of(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-@pytest.mark.parametrize("killed", ["while images are written", "before the manifest is written"])
+@pytest.mark.parametrize("killed", ["write_images", "write_arrays", "finish_shard"])
 def test_a_resumed_collection_has_the_same_bytes(folder, tmp_path, killed, monkeypatch):
     out = tmp_path / "dataset"
 
     def kill(*args):
         raise KeyboardInterrupt
 
-    images = killed == "while images are written"
-    module, name = (dataset.records, "write_images") if images else (dataset.collecting, "write_arrays")
-    write, calls = getattr(module, name), itertools.count()
-    monkeypatch.setattr(module, name, lambda *args: write(*args) if next(calls) == 0 else kill())
+    module = dataset.shards if killed == "write_arrays" else dataset.records
+    write, calls = getattr(module, killed), itertools.count()
+    monkeypatch.setattr(module, killed, lambda *args: write(*args) if next(calls) == 0 else kill())
     with pytest.raises(KeyboardInterrupt):
         dataset.collect(SMALL, sts.Sensor(), out)
     monkeypatch.undo()
-    (out / f"{SHARDS[1]}.array_record").write_bytes(b"half")  # neither file of this shard is in the manifest
+    (out / f"{SHARDS[1]}.array_record").write_bytes(b"half")  # this shard has no manifest
     with pytest.raises(FileNotFoundError, match="not finished"):
         dataset.load(out)
     before = (out / f"{SHARDS[0]}.npz").stat().st_mtime_ns
@@ -150,9 +149,39 @@ def test_a_resumed_collection_has_the_same_bytes(folder, tmp_path, killed, monke
     assert bytes_of(out) == bytes_of(folder)
     assert (out / f"{SHARDS[0]}.npz").stat().st_mtime_ns == before
     assert seen[-1].done == seen[-1].total
+    assert {path.name for path in out.iterdir() if path.name.startswith(".")} == {".lock"}
     stamps = {path: path.stat().st_mtime_ns for path in out.iterdir()}
     dataset.collect(SMALL, sts.Sensor(), out)
     assert stamps == {path: path.stat().st_mtime_ns for path in out.iterdir()}
+
+
+def test_several_processes_make_the_same_bytes(folder, tmp_path):
+    first = dataset.collect(SMALL, sts.Sensor(), tmp_path, process_index=1, process_count=2)
+    assert sorted(path.name for path in tmp_path.glob("shard-*.npz")) == [f"{SHARDS[1]}.npz"]
+    with pytest.raises(FileNotFoundError, match=r"manifest\.json is missing: the collection is not finished"):
+        dataset.load(tmp_path)
+    (tmp_path / f".{SHARDS[0]}.npz.7-00.partial").write_text("half")
+    (tmp_path / f".{SHARDS[1]}.npz.8-00.partial").write_text("being written")
+    with storage.lock(tmp_path, part=(1, 2)):
+        second = dataset.collect(SMALL, sts.Sensor(), tmp_path, process_index=0, process_count=2)
+    assert bytes_of(tmp_path) | {".lock": b""} == bytes_of(folder)
+    assert dataset.Collected(first.resampled + second.resampled, ()) == dataset.collect(SMALL, sts.Sensor(), folder)
+
+
+def test_a_dataset_whose_manifest_grew_with_every_shard_is_continued_and_read(folder, copied):
+    (copied / f"{SHARDS[0]}.json").unlink()
+    (copied / f"{SHARDS[1]}.json").unlink()
+    identity = dataset.load(copied).identity
+    whole = storage.read_manifest(copied, "")
+    for ending in ("array_record", "npz"):
+        (copied / f"{SHARDS[1]}.{ending}").unlink()
+        del whole.files[f"{SHARDS[1]}.{ending}"]
+    storage.write_manifest(copied, *whole)
+    with pytest.raises(FileNotFoundError, match=f"{SHARDS[1]}.array_record is missing: the collection is not finished"):
+        dataset.load(copied)
+    dataset.collect(SMALL, sts.Sensor(), copied)
+    assert bytes_of(folder) == bytes_of(copied) | {f"{SHARDS[0]}.json": (folder / f"{SHARDS[0]}.json").read_bytes()}
+    assert dataset.load(copied).identity == identity
 
 
 @pytest.fixture
@@ -187,7 +216,7 @@ def swap_shards(*endings):
     return change
 
 
-EDITED = r" is not the file that manifest\.json lists .*delete it \(of a shard both files\) and collect"
+EDITED = r" is not the file that (manifest|shard-.*)\.json lists .*delete it \(of a shard all files\) and collect"
 
 
 @pytest.mark.parametrize(
@@ -202,7 +231,10 @@ EDITED = r" is not the file that manifest\.json lists .*delete it \(of a shard b
         (flip("sensor.json", 0.5), r"sensor\.json (is not the file|was made with|cannot be read)"),
         (flip("manifest.json", 0.5), r"manifest\.json (is damaged|cannot be read).*: restore it, or collect into"),
         (edit("manifest.json", "facts", {"shards": 1}), r"manifest\.json is damaged"),
-        (lambda at: (at / "manifest.json").unlink(), r"manifest\.json is missing, but .* has shards: restore it, or"),
+        (
+            lambda at: [path.unlink() for path in (at / "manifest.json", *at.glob("shard-*.json"))],
+            r"manifest\.json is missing, but .* has shards: restore it, or",
+        ),
         (rewrite("collection.json", lambda data: b"\xff"), r"collection\.json cannot be read as JSON"),
         (of_format(4), r"collection\.json is of a dataset of format 4, .* reads format 6: collect into another"),
     ],
@@ -266,6 +298,38 @@ def test_an_edited_description_is_named_and_deleted_files_are_made_again_with_th
     assert dataset.load(copied).identity == dataset.load(folder).identity != dataset.load(sparse).identity
 
 
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (flip(f"{SHARDS[0]}.json", 0.5), r"00000-of-00002\.json (is damaged|cannot be read)"),
+        (swap_shards(".json"), r"00000-of-00002\.json is that of another shard or dataset"),
+        (swap_shards(".json", ".npz", ".array_record"), r"00000-of-00002\.json is that of another shard or dataset"),
+        (lambda at: foreign(at), r"00000-of-00002\.json is that of another shard or dataset"),
+        (flip(f"{SHARDS[1]}.npz", 0.5), r"00001-of-00002\.npz" + EDITED),
+    ],
+)
+def test_damage_of_an_unfinished_dataset_is_named(copied, damage, message):
+    (copied / "manifest.json").unlink()
+    damage(copied)
+    before = bytes_of(copied)
+    with pytest.raises(storage.DamagedFileError, match=message):
+        dataset.collect(SMALL, sts.Sensor(), copied)
+    assert bytes_of(copied) == before
+
+
+def foreign(at):
+    listed = storage.read_manifest(at, "", name=f"{SHARDS[0]}.json")
+    storage.write_manifest(at, listed.files, {"dataset": "0" * 64}, name=f"{SHARDS[0]}.json")
+
+
+def test_a_lost_manifest_is_written_again(folder, copied):
+    (copied / "manifest.json").unlink()
+    with pytest.raises(FileNotFoundError, match=r"manifest\.json is missing: the collection is not finished"):
+        dataset.load(copied)
+    dataset.collect(SMALL, sts.Sensor(), copied)
+    assert bytes_of(copied) == bytes_of(folder)
+
+
 def test_the_work_directory_of_an_experiment_stands_for_its_dataset(folder, tmp_path):
     (tmp_path / "dataset").symlink_to(folder)
     storage.write_manifest(tmp_path, {}, {})  # of the evaluation
@@ -294,5 +358,11 @@ def test_a_folder_of_another_collection_or_another_process_is_refused(copied):
     other = dataclasses.replace(SMALL, scenario=sts.physics.Freefall(frames=12, spread=0.02))
     with pytest.raises(ValueError, match=r"spread = 0\.05, but the current settings have scenario\.spread = 0\.02"):
         dataset.collect(other, sts.Sensor(), copied)
-    with storage.lock(copied), pytest.raises(storage.LockedError, match="copy is in use by process"):
-        dataset.collect(SMALL, sts.Sensor(), copied)
+    for held, asked in (((0, 1), (0, 1)), ((0, 2), (0, 2)), ((1, 2), (0, 1)), ((0, 1), (1, 2)), ((0, 2), (1, 3))):
+        with (
+            storage.lock(copied, part=held),
+            pytest.raises(storage.LockedError, match=r"copy is in use by process \d+ on"),
+        ):
+            dataset.collect(SMALL, sts.Sensor(), copied, process_index=asked[0], process_count=asked[1])
+    with pytest.raises(ValueError, match=r"process_index must be from 0 to process_count - 1 = 1, got 2"):
+        dataset.collect(SMALL, sts.Sensor(), copied, process_index=2, process_count=2)

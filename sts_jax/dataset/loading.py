@@ -16,7 +16,17 @@ from sts_jax import geometry, physics
 from sts_jax._checked import check_arrays, in_32_bits
 from sts_jax.dataset import records
 from sts_jax.dataset.measurement import Measurement, measured
-from sts_jax.storage import DamagedFileError, Finite, decode, digest, read_arrays, read_fields, read_json, verify
+from sts_jax.storage import (
+    MANIFEST,
+    DamagedFileError,
+    Finite,
+    decode,
+    digest,
+    read_arrays,
+    read_fields,
+    read_json,
+    verify,
+)
 
 
 class Pairs(NamedTuple):
@@ -342,6 +352,10 @@ def load(folder: str | Path) -> Dataset:
     if not (folder / "collection.json").exists() and (folder / "dataset" / "collection.json").exists():
         folder /= "dataset"
     manifest = records.manifest_of(folder)
+    if manifest is None and (folder / "collection.json").exists():
+        raise FileNotFoundError(
+            f"{folder / MANIFEST} is missing: the collection is not finished. Call `collect` to continue it."
+        )
     if manifest is None:
         raise FileNotFoundError(f"{folder} is not a collected dataset: give another folder, or call `collect`.")
     count = manifest.facts["shards"]

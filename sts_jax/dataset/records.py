@@ -2,10 +2,11 @@
 
 A file is written as a whole or not at all, and the same inputs give the same bytes. `NAME.array_record` has one record
 per rendered frame: the visual image, the tactile image (`uint8`, `(height, width, 3)`) and the segmentation (bits), in
-that order, and then one record per view. `NAME.npz` has all other data of the shard as named arrays.
+that order, and then one record per view. `NAME.npz` has all other data of the shard as named arrays. `NAME.json`, which
+is written last, is a manifest of these two files: a shard without it counts as missing.
 
-`manifest.json` lists both files of every finished shard, and the descriptions. A shard that it does not list counts as
-missing.
+`manifest.json` is written when all shards are finished. It lists both files of every shard, and the descriptions. In
+older datasets it grew with every shard, and the shards had no manifests of their own.
 """
 
 import dataclasses
@@ -18,7 +19,16 @@ import numpy as np
 import pydantic
 from array_record.python.array_record_module import ArrayRecordReader, ArrayRecordWriter
 
-from sts_jax.storage import MANIFEST, DamagedFileError, Manifest, read_json, read_manifest, write_whole
+from sts_jax.storage import (
+    MANIFEST,
+    DamagedFileError,
+    Manifest,
+    checksums,
+    read_json,
+    read_manifest,
+    write_manifest,
+    write_whole,
+)
 
 FORMAT = 6  # format of a dataset's files, incremented when older files can no longer be read
 DESCRIPTIONS = ("collection.json", "sensor.json", "split.json")
@@ -43,18 +53,54 @@ class Images(NamedTuple):
     segmentation: np.ndarray  # bool (n, height, width)
 
 
+@dataclasses.dataclass(frozen=True)
+class _ShardFacts:
+    """The facts in the manifest of a shard."""
+
+    dataset: str
+
+
 def shard_files(index: int, count: int) -> tuple[str, str]:
     """Names of the image file and the array file of a shard."""
     name = f"shard-{index:05d}-of-{count:05d}"
     return f"{name}.array_record", f"{name}.npz"
 
 
+def sidecar(index: int, count: int) -> str:
+    """Name of the manifest of a shard."""
+    return f"shard-{index:05d}-of-{count:05d}.json"
+
+
 def remedy(folder: Path) -> str:
     """The remedy for a damaged file of a dataset."""
     return (
-        f"restore it, or delete it (of a shard both files) and collect into {folder} again, which makes only what is "
+        f"restore it, or delete it (of a shard all files) and collect into {folder} again, which makes only what is "
         "missing"
     )
+
+
+def finish_shard(folder: Path, dataset: str, index: int, count: int) -> None:
+    """Write the manifest of a shard, whose two files are written already. `dataset` is the digest of `described`."""
+    files = checksums(folder, shard_files(index, count))
+    write_manifest(folder, files, {"dataset": dataset}, name=sidecar(index, count))
+
+
+def listed(folder: Path, dataset: str, manifest: Manifest | None, index: int, count: int) -> dict[str, str] | None:
+    """Checksums of the files of a finished shard, by name, or None if the shard is not finished.
+
+    Args:
+        dataset: As in `finish_shard`.
+        manifest: The manifest of the dataset, or None if there is none yet.
+    """
+    files, name = shard_files(index, count), sidecar(index, count)
+    shard = read_manifest(folder, remedy(folder), _ShardFacts, name=name)
+    if shard is not None:
+        if tuple(shard.files) != files or shard.facts["dataset"] != dataset:
+            raise DamagedFileError(f"{folder / name} is that of another shard or dataset: {remedy(folder)}.")
+        return shard.files
+    if manifest is not None and all(file in manifest.files for file in files):
+        return {file: manifest.files[file] for file in files}
+    return None
 
 
 def manifest_of(folder: Path) -> Manifest | None:
@@ -69,7 +115,8 @@ def manifest_of(folder: Path) -> Manifest | None:
                 "collect into another folder, or read this one with the version that wrote it."
             )
     manifest = read_manifest(folder, f"restore it, or collect into another folder than {folder}", _Facts)
-    if manifest is None and any(folder.glob("shard-*")):
+    if manifest is None and not any(folder.glob("shard-*.json")) and len(list(folder.glob("shard-*.npz"))) > 1:
+        # A process that is killed leaves at most one finished pair of files without a manifest.
         raise DamagedFileError(
             f"{folder / MANIFEST} is missing, but {folder} has shards: restore it, or collect into another folder."
         )
