@@ -160,7 +160,8 @@ def test_a_press_sinks_as_deep_in_the_physics_as_in_the_picture(force, side, mas
 
 def test_the_pads_constants_count_whatever_the_object_has():
     geom = '<geom name="ball" size=".02" solref=".05 1" solimp=".5 .6 .1" friction=".3"/>'
-    spec = specification(f'<body pos="0 0 .02"><freejoint/>{geom}</body>')
+    spec = specification(f'<body pos="0 0 .02"><freejoint/>{geom}</body><geom name="else" pos="0 0 -1" size=".1"/>')
+    spec.geom("else").priority = 3
     scene.attach(spec, "floor", SENSOR, name="pad")
     scene.attach(spec, "tip", SENSOR, name="rough", friction=0.8)
     model = spec.compile()
@@ -199,6 +200,28 @@ def test_the_site_may_have_any_frame_and_both_pads_of_a_closed_gripper_are_measu
     np.testing.assert_allclose(wrenches["b"]["a"], physics.wrench(model, data, "b", "b"), atol=1e-3 * force[2])
 
 
+@pytest.mark.parametrize(
+    "default", ["", '<geom euler="0 90 0" fromto="0 0 0 0 0 1" mesh="x"/><site pos="1 1 1" euler="9 9 9"/>']
+)
+def test_a_site_of_an_attached_robot_keeps_its_units_and_defaults_do_not_turn_the_pad(default):
+    robot = mujoco.MjSpec.from_string(f"""
+    <mujoco><compiler angle="radian" eulerseq="ZYX"/><default><default class="robot">{default}</default></default>
+    <worldbody><body name="hand" childclass="robot" euler=".1 .2 .3"><frame euler="0 .5 0" pos=".1 0 0">
+    <site name="tip" pos="0 .1 0" euler="0 1.2 .3"/></frame></body></worldbody></mujoco>""")
+    spec = specification("")
+    spec.attach(robot, prefix="robot_", frame=spec.worldbody.add_frame())
+    scene.attach(spec, "robot_tip", SMALL, name="pad")
+    for model in (spec.compile(), mujoco.MjModel.from_xml_string(spec.to_xml())):
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        site, thickness = data.site("robot_tip"), SMALL.gel.thickness
+        axes = site.xmat.reshape(3, 3)
+        for part, depth in ((data.site("pad"), 0), (data.geom("pad"), thickness / 2)):
+            np.testing.assert_allclose(part.xmat, site.xmat, atol=1e-6)
+            np.testing.assert_allclose(part.xpos, site.xpos - depth * axes[:, 2], atol=1e-6)
+        np.testing.assert_allclose(2 * model.geom("pad").size, [0.04, 0.04, thickness], rtol=1e-6)
+
+
 def test_sensors_store_all_contacts_that_mujoco_finds(crowd):
     model, data = crowd
     found = np.concatenate([data.sensor(i).data[::17] for i in range(model.nsensor)])
@@ -206,7 +229,8 @@ def test_sensors_store_all_contacts_that_mujoco_finds(crowd):
 
 
 REFUSED = {
-    "a site that does not exist": ({"site": "tpi"}, "no site 'tpi', only 'floor', 'tip'"),
+    "a site that does not exist": ({"site": "tpi"}, "no site 'tpi', only 'floor', 'line', 'tip'"),
+    "a site between two points": ({"site": "line"}, "the site 'line' is given by fromto"),
     "a name that is taken": ({"name": "ball"}, "has a geom or a site 'ball' already"),
     "negative friction": ({"friction": -0.1}, "friction must be >= 1e-05"),
     "a press that is too deep": (
@@ -224,7 +248,8 @@ REFUSED = {
 @pytest.mark.parametrize("case", REFUSED)
 def test_bad_arguments_of_attach_are_named(case):
     changed, message = REFUSED[case]
-    spec = specification('<body><freejoint/><geom name="ball" size=".02"/></body>')
+    line = '<site name="line" type="capsule" size=".01" fromto="0 0 0 1 0 0"/>'
+    spec = specification(f'<body><freejoint/><geom name="ball" size=".02"/>{line}</body>')
     arguments = {"site": "tip", "sensor": SENSOR, "name": "pad"} | changed
     with pytest.raises(ValueError, match=message):
         scene.attach(spec, arguments.pop("site"), arguments.pop("sensor"), **arguments)

@@ -21,10 +21,12 @@ SMALL = dataclasses.replace(SENSOR, gel=dataclasses.replace(SENSOR.gel, size=(0.
 SIZE = (32, 32)
 
 
-def compiled(objects: str, sensor: sts.Sensor = SENSOR, finger: str = "", asset: str = "") -> mujoco.MjModel:
+def compiled(
+    objects: str, sensor: sts.Sensor = SENSOR, finger: str = "", asset: str = "", option: str = ""
+) -> mujoco.MjModel:
     """Objects above a pad on the world, and a finger without pad."""
     spec = mujoco.MjSpec.from_string(f"""
-    <mujoco><option gravity="0 0 0"/><asset>{asset}</asset><worldbody><site name="tip"/>{objects}
+    <mujoco><option gravity="0 0 0">{option}</option><asset>{asset}</asset><worldbody><site name="tip"/>{objects}
     <body name="finger" pos=".5 0 0">{finger}<site name="finger_tip"/></body></worldbody></mujoco>""")
     scene.attach(spec, "tip", sensor, name="pad")
     return spec.compile()
@@ -210,6 +212,7 @@ def test_each_finger_sees_the_other_one_but_not_itself(gripper):
 def test_bodies_and_geoms_can_be_hidden(objects):
     view = scene.View(objects[0], {"pad": SENSOR}, hide=["wire", "sheet", "egg"])
     assert view.bodies == ("ball", "rod", "can", "block")
+    assert scene.View(compiled(BALL + CLOTH), {"pad": SENSOR}, hide=["cloth"]).bodies == ("ball",)
 
 
 def test_a_body_can_replace_the_geoms_of_a_body(objects):
@@ -226,6 +229,10 @@ def test_a_body_can_replace_the_geoms_of_a_body(objects):
 
 
 BALL = '<body name="ball" pos="0 0 .1"><freejoint/><geom name="ball" size=".02"/></body>'
+CLOTH = (
+    '<flexcomp name="cloth" type="grid" count="3 3 1" spacing=".01 .01 .01" pos="0 0 1" radius=".001">'
+    '<edge equality="true"/></flexcomp>'
+)
 BODY = geometry.body_of(mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{BALL}</worldbody></mujoco>"), [0])
 
 
@@ -239,8 +246,8 @@ def late() -> mujoco.MjModel:
     return spec.compile()
 
 
-def on_finger(sensor: sts.Sensor, half: float) -> mujoco.MjModel:
-    geom = f'<geom type="box" size="{half} .02 .01"/>'
+def on_finger(sensor: sts.Sensor, half: float, z: float = 0) -> mujoco.MjModel:
+    geom = f'<geom type="box" size="{half} .02 .01" pos="0 0 {z}"/>'
     spec = mujoco.MjSpec.from_string(
         f'<mujoco><worldbody>{BALL}<body name="finger"><joint/>{geom}<site name="tip"/></body></worldbody></mujoco>'
     )
@@ -273,6 +280,10 @@ INVALID = {
         lambda: (on_finger(SENSOR, 0.01), {}),
         r"the pad 'pad' measures 150 x 150 mm, but the body 'finger' that carries it only 20 x 40 mm: .*sized\(0.02\)",
     ),
+    "a site that points into the finger": (
+        lambda: (on_finger(SMALL, 0.02, 0.011), {"sensors": {"pad": SMALL}}),
+        r"the pad 'pad' faces its own body 'finger', which reaches 21 mm in front of the gel .*: turn the site",
+    ),
     "another sensor than that of attach": (
         lambda: (compiled(BALL, SMALL), {}),
         "the pad 'pad' measures 40 x 40 x 5 mm, but its sensor has a gel of 150 x 150 x 5 mm",
@@ -287,6 +298,11 @@ INVALID = {
     ),
     "hiding what does not exist": (lambda: (compiled(BALL), {"hide": ["bal"]}), "hide has the name 'bal'"),
     "nothing to see": (lambda: (compiled(BALL), {"hide": ["ball"]}), "sensor 'pad' can see no body"),
+    "sensors switched off": (
+        lambda: (compiled(BALL, option='<flag sensor="disable"/>'), {}),
+        "MuJoCo's sensors are switched off",
+    ),
+    "a flexible body": (lambda: (compiled(BALL + CLOTH), {}), r"flex 'cloth' .*hide=\['cloth'\]"),
     "no sensor": (lambda: (compiled(BALL), {"sensors": {}}), "sensors is empty"),
 }
 
@@ -313,8 +329,9 @@ def test_bad_data_is_named(objects):
     ball = compiled(BALL)
     with pytest.raises(ValueError, match=r"data of another model"):
         view(forward(ball))
-    with pytest.raises(ValueError, match=r"call mujoco.mj_forward"):
-        view(mujoco.MjData(model))
+    for empty in (mujoco.MjData(model), mjx.make_data(model)):
+        with pytest.raises(ValueError, match=r"call mj_forward \(in MJX, mjx.forward\)"):
+            view(empty)
     batch = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), mjx.put_data(ball, forward(ball)))
     with pytest.raises(ValueError, match=r"use jax.vmap"):
         scene.View(ball, {"pad": SENSOR}).wrenches(batch)

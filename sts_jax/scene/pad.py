@@ -9,6 +9,7 @@ other geoms in all cases.
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import field
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -31,6 +32,8 @@ DATA = sum(
 BY_DISTANCE = 1  # how the stored contacts are chosen, `reduce="mindist"`
 GREATER = 1e6  # weight of the pad's contact constants when MuJoCo averages those of two geoms
 COLOR = (0.7, 0.7, 0.8, 1.0)  # of the pad in the views of other sensors (paper's code)
+_QUAT = mujoco.mjtOrientation.mjORIENTATION_QUAT
+_PLAIN: Any = {"quat": [1, 0, 0, 0], "fromto": [np.nan] * 6}  # the defaults of a specification may turn and stretch
 IMPEDANCE = 0.9  # MuJoCo's solimp at any depth, for `Press`
 
 
@@ -89,6 +92,9 @@ def attach(
     options of the specification stay as they are: use `cone="elliptic"` and an `impratio` of 10 or more, else what is
     held slips.
 
+    Two constants of the other geom win over those of the pad, as everywhere in MuJoCo: all of a geom with a `priority`
+    above 0, unless `friction` is given, and a negative `solref`. The pad's `contype` and `conaffinity` are 1.
+
     Args:
         spec: Specification with all bodies that can touch the pad.
         site: Name of the site.
@@ -103,6 +109,8 @@ def attach(
             f"the specification has no site {site!r}, only {', '.join(repr(s.name) for s in spec.sites) or 'none'}: "
             "add a site whose z axis points out of the gel"
         )
+    if not np.isnan(place.fromto[0]):
+        raise ValueError(f"the site {site!r} is given by fromto: give its frame by pos, and by quat, euler or zaxis")
     if spec.geom(name) is not None or (name != site and spec.site(name) is not None):
         raise ValueError(f"the specification has a geom or a site {name!r} already: choose another name for the pad")
     if friction is not None and not mujoco.mjMINMU <= friction < np.inf:  # MJX computes NaN without friction
@@ -113,10 +121,10 @@ def attach(
     if press is not None:
         solref, solimp = press.solref(gel), (IMPEDANCE, IMPEDANCE)
     (width, height), thickness = gel.size, float(gel.thickness)
-    owner = place.parent
-    frame = owner.add_frame(pos=place.pos, quat=place.quat)
-    for part in ("type", "axisangle", "xyaxes", "zaxis", "euler"):
-        setattr(frame.alt, part, getattr(place.alt, part))
+    owner, units, quat = place.parent, place.compiler, place.quat
+    if place.alt.type != _QUAT:  # the units are those of the file that the site comes from
+        quat = spec.resolve_orientation(degree=units.degree, sequence=units.eulerseq, orientation=place.alt)
+    frame = owner.add_frame(pos=place.pos, quat=quat)
     if place.frame is not None:
         frame.set_frame(place.frame)
     pad = owner.add_geom(
@@ -124,12 +132,14 @@ def attach(
         type=mujoco.mjtGeom.mjGEOM_BOX,
         size=[float(width) / 2, float(height) / 2, thickness / 2],
         pos=[0, 0, -thickness / 2],
+        **_PLAIN,
+        meshname="",
         mass=0,
         contype=1,
         conaffinity=1,
         condim=CONDIM,
         friction=[mujoco.mjMINMU] * 3 if friction is None else [friction, constants.torsional, constants.rolling],
-        priority=0 if friction is None else 1,
+        priority=0 if friction is None else 1 + max((geom.priority for geom in spec.geoms), default=0),
         solref=solref,
         solimp=[*solimp, constants.width, 0.5, 2],
         solmix=GREATER,
@@ -139,9 +149,12 @@ def attach(
         rgba=COLOR,
         material="",
     )
+    pad.alt.type = _QUAT
     pad.set_frame(frame)
     if name != site:
-        owner.add_site(name=name).set_frame(frame)
+        own = owner.add_site(name=name, pos=[0, 0, 0], **_PLAIN)
+        own.alt.type = _QUAT
+        own.set_frame(frame)
     _add_contact_sensors(spec, pad)
 
 

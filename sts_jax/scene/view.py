@@ -16,7 +16,7 @@ from sts_jax import geometry
 from sts_jax._checked import checked, in_32_bits
 from sts_jax._ranges import MOST_PIXELS
 from sts_jax.frame import Frame
-from sts_jax.objects.body import Body
+from sts_jax.objects.body import Body, is_traced
 from sts_jax.physics.scene import mjx
 from sts_jax.rendering.group import Group, draw_group, group
 from sts_jax.scene.geometry import body_of, geom_name, visible
@@ -81,10 +81,12 @@ class View:
                 frame of the MuJoCo body.
             groups: Groups of geoms that are drawn. None: the visual geoms of each body (`contype` and `conaffinity` are
                 0), or all its geoms if it has no visual ones.
-            hide: Names of bodies and geoms that are not drawn.
+            hide: Names of bodies and geoms that are not drawn. Flexes, which are neither drawn nor felt, must be named.
         """
         if not sensors:
             raise ValueError("sensors is empty: name each pad and its sensor, as in {'left': sensor}")
+        if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR:
+            raise ValueError('MuJoCo\'s sensors are switched off, so nothing is felt: remove <flag sensor="disable"/>')
         pads = {name: _pad_geom(model, name, sensor) for name, sensor in sensors.items()}
         for name in pads:
             _check_finger(model, name, pads)
@@ -154,8 +156,8 @@ class View:
                     f"data.{name} has the shape {np.shape(getattr(data, name))}, but in the view's model it has "
                     f"{shape}: this is the data of another model, so make a View of that model"
                 )
-        if isinstance(data, mujoco.MjData) and not data.xquat.any():
-            raise ValueError("data has no positions yet: call mujoco.mj_forward(model, data) before")
+        if not is_traced(data.xquat) and not np.any(data.xquat):
+            raise ValueError("data has no positions yet: call mj_forward (in MJX, mjx.forward) before")
         xmat = jnp.asarray(data.site_xmat, jnp.float32).reshape(-1, 3, 3)
         arrays = {name: jnp.asarray(getattr(data, name), jnp.float32) for name in self._shapes}
         return _Arrays(**arrays, site_xmat=xmat)
@@ -232,7 +234,7 @@ def _pad_geom(model: mujoco.MjModel, name: str, sensor: Sensor) -> int:
 
 
 def _check_finger(model: mujoco.MjModel, name: str, pads: Mapping[str, int]) -> None:
-    """Raise a ValueError if a pad is larger than the body that carries it, seen along the pad's normal."""
+    """Raise a ValueError if a pad faces the body that carries it, or is larger, seen along the pad's normal."""
     pad, site = pads[name], model.site(name)
     carrier = int(model.geom_bodyid[pad])
     geoms = np.setdiff1d(np.flatnonzero(model.geom_bodyid == carrier), list(pads.values()))
@@ -251,6 +253,15 @@ def _check_finger(model: mujoco.MjModel, name: str, pads: Mapping[str, int]) -> 
             f"the pad {name!r} measures {_millimetres(size)}, but the body {_body_name(model, carrier)!r} that carries "
             f"it only {_millimetres(finger)}: use a smaller sensor, such as Sensor.sized({finger.min():.3g}), or put "
             "the site on a body without other geoms"
+        )
+    thickness = 2 * model.geom_size[pad][2]
+    over = [part for part in corners if (part.min(axis=0)[:2] < 0).all() and (part.max(axis=0)[:2] > 0).all()]
+    depth = np.concatenate([*over, np.zeros((1, 3))])[:, 2]
+    if depth.max() > thickness and depth.min() > -thickness:
+        raise ValueError(
+            f"the pad {name!r} faces its own body {_body_name(model, carrier)!r}, which reaches "
+            f"{_millimetres([depth.max()])} in front of the gel and not behind it: turn the site, whose z axis must "
+            "point out of the finger"
         )
 
 
@@ -343,8 +354,12 @@ def _check_names(
                 "object, not both"
             )
         bodies[name].check()
+    flexes = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, k) or f"flex {k}" for k in range(model.nflex)]
+    for name in flexes:
+        if name not in hide:
+            raise ValueError(f"flex {name!r} can be neither drawn nor felt: leave it out with hide=[{name!r}]")
     for name in hide:
-        if name not in names and mujoco.mj_name2id(model, _GEOM, name) < 0:
+        if name not in {*names, *flexes} and mujoco.mj_name2id(model, _GEOM, name) < 0:
             raise ValueError(
                 f"hide has the name {name!r}, which is no geom, and the model has only the bodies {listed}"
             )
