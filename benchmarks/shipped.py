@@ -18,6 +18,7 @@ import tyro
 
 import sts_jax as sts
 from benchmarks.instruments.experiments import EXPERIMENTS
+from experiments.shared.datasets import collect
 from experiments.shared.evaluate import MAIN_SUBSETS
 from experiments.shared.terminal import Bar
 from sts_jax import dataset, evaluation, physics, statespace
@@ -90,9 +91,7 @@ def main(args: Args) -> str:
     predictor = _predictor(args, scenario)
     folder = args.workdir or Path("runs") / f"shipped-{args.model}"
     made = collection(args)
-    with Bar() as bar:
-        dataset.collect(made, sts.Sensor(), folder, progress=lambda p: bar(f"collect: {p.stage}", p.done, p.total))
-    data = dataset.load(folder)
+    data = collect(made, sts.Sensor(), folder)
     rows = evaluation.rows_of(data, "object")
     size = EXPERIMENTS[args.model].DEFAULT.image_size
     train, given = dataset.reduced(data.pairs(rows["train"]), size), data.pairs(rows["test"])

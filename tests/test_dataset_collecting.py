@@ -6,6 +6,7 @@ import itertools
 import json
 import shutil
 
+import fsspec
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -148,7 +149,8 @@ def test_a_resumed_collection_has_the_same_bytes(folder, tmp_path, killed, monke
     dataset.collect(SMALL, sts.Sensor(), out, progress=seen.append)
     assert bytes_of(out) == bytes_of(folder)
     assert (out / f"{SHARDS[0]}.npz").stat().st_mtime_ns == before
-    assert seen[-1].done == seen[-1].total
+    assert seen[0] == dataset.Progress(4, 12 + 3 * 2, 8, 12 + 7 * 2)
+    assert seen[-1] == dataset.Progress(8, 12 + 7 * 2, 8, 12 + 7 * 2)
     assert {path.name for path in out.iterdir() if path.name.startswith(".")} == {".lock"}
     stamps = {path: path.stat().st_mtime_ns for path in out.iterdir()}
     dataset.collect(SMALL, sts.Sensor(), out)
@@ -317,9 +319,82 @@ def test_damage_of_an_unfinished_dataset_is_named(copied, damage, message):
     assert bytes_of(copied) == before
 
 
+@pytest.mark.parametrize(
+    ("damage", "number"),
+    [
+        (flip(f"{SHARDS[0]}.array_record", 0.5), 1),
+        (rewrite(f"{SHARDS[1]}.npz", lambda data: data[:-1000]), 1),
+        (lambda at: (at / f"{SHARDS[0]}.array_record").unlink(), 1),
+        (swap_shards(".json", ".npz", ".array_record"), 2),
+        (flip("manifest.json", 0.5), 1),
+        (lambda at: [flip(name, 0.5)(at) for name in ("split.json", "sensor.json", f"{SHARDS[0]}.npz")], 3),
+    ],
+)
+def test_damage_is_repaired(folder, copied, damage, number):
+    damage(copied)
+    repaired = dataset.collect(SMALL, sts.Sensor(), copied, repair=True).repaired
+    assert bytes_of(copied) == bytes_of(folder)
+    assert len(repaired) == number
+    assert all(str(copied) in line for line in repaired)
+
+
+def files_behind(url):
+    system, path = fsspec.core.url_to_fs(url)
+    return {name.rpartition("/")[2]: system.cat_file(name) for name in system.ls(path, detail=False)}
+
+
+@pytest.fixture
+def url(monkeypatch, tmp_path):
+    """A place behind a URL, and a cache of its own."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    yield "memory://bucket/falls"
+    system, path = fsspec.core.url_to_fs("memory://bucket")
+    system.rm(path, recursive=True)
+
+
+def test_a_dataset_behind_a_url_has_the_same_bytes_and_is_read_from_a_copy(folder, url, tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"falls/manifest\.json is missing: it is not a collected dataset"):
+        dataset.load(url)
+    dataset.collect(SMALL, sts.Sensor(), url, process_index=1, process_count=2)
+    with pytest.raises(FileNotFoundError, match=r"falls/manifest\.json is missing: the collection is not finished"):
+        dataset.load(url)
+    system, path = fsspec.core.url_to_fs(url)
+    system.pipe_file(f"{path}/{SHARDS[0]}.npz", b"of a killed process, which has not written the shard's manifest")
+    whole = dataset.collect(SMALL, sts.Sensor(), url)
+    assert files_behind(url) | {".lock": b""} == bytes_of(folder)
+    assert whole == dataset.collect(SMALL, sts.Sensor(), url) == dataset.collect(SMALL, sts.Sensor(), folder)
+    data = dataset.load(url)
+    assert data.identity == dataset.load(folder).identity
+    assert data.shards[0].is_relative_to(tmp_path / "cache")
+    system.rm_file(f"{path}/{SHARDS[0]}.npz")  # the copy is read
+    assert dataset.load(url).identity == data.identity
+    data.shards[0].write_bytes(b"damaged")
+    with pytest.raises(storage.DamagedFileError, match=r"00000-of-00002\.array_record is not the file"):
+        dataset.load(url)
+
+
+def test_a_dataset_behind_a_url_is_repaired(folder, url, tmp_path):
+    system, path = fsspec.core.url_to_fs(url)
+    for name, content in bytes_of(folder).items():
+        system.pipe_file(f"{path}/{name}", content)
+    system.pipe_file(f"{path}/{SHARDS[0]}.npz", b"damaged")
+    system.rm_file(f"{path}/{SHARDS[1]}.array_record")
+    with pytest.raises(storage.DamagedFileError, match=f"{url}/{SHARDS[1]}.array_record is missing"):
+        dataset.collect(SMALL, sts.Sensor(), url)
+    assert len(dataset.collect(SMALL, sts.Sensor(), url, repair=True).repaired) == 2
+    assert files_behind(url) == bytes_of(folder)
+
+
+def test_a_url_of_a_file_is_its_path_and_a_wrong_one_is_named(folder):
+    assert dataset.load(f"file://{folder}").identity == dataset.load(folder).identity
+    for wrong in ("no-such-protocol://a/b", "s3fs-is-missing://a"):
+        with pytest.raises(OSError, match=rf"cannot open {wrong}: .*[Pp]rotocol.*Check the URL"):
+            dataset.load(wrong)
+
+
 def foreign(at):
     listed = storage.read_manifest(at, "", name=f"{SHARDS[0]}.json")
-    storage.write_manifest(at, listed.files, {"dataset": "0" * 64}, name=f"{SHARDS[0]}.json")
+    storage.write_manifest(at, listed.files, {**listed.facts, "dataset": "0" * 64}, name=f"{SHARDS[0]}.json")
 
 
 def test_a_lost_manifest_is_written_again(folder, copied):

@@ -77,7 +77,9 @@ def test_the_preset_paper_has_the_counts_of_the_paper(experiment, classes, traje
 
 def test_options_reach_the_experiment(tmp_path, monkeypatch):
     ran = []
-    monkeypatch.setattr(run, "main", lambda config, workdir, only, skin: ran.append((config, workdir, only, skin)))
+    monkeypatch.setattr(
+        run, "main", lambda config, workdir, only, skin, source: ran.append((config, workdir, only, skin))
+    )
     options = ["--hidden", "off", "--classes", "fork", "bottle", "--parts", "--skin", "clear"]
     monkeypatch.setattr("sys.argv", ["freefall", *options])
     run.command(freefall.PRESETS, str(tmp_path), "What it does.")

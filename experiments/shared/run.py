@@ -13,6 +13,7 @@ import tyro
 
 import sts_jax as sts
 from experiments.shared.config import MODELS, NONE, Config, Extensions, Run, check
+from experiments.shared.datasets import collect, link
 from experiments.shared.evaluate import evaluate
 from experiments.shared.terminal import Bar, on_one_line, say
 from sts_jax import dataset, evaluation, mvae, statespace, storage, training
@@ -55,6 +56,8 @@ class Args:
     # files
     up: Literal["x", "y", "z"] | None = None
     parts: bool = False  # decompose an object into convex parts if its convex hull fits badly
+    # folder or URL of a finished dataset (of `experiments.collect`, also of another computer), which is not collected
+    dataset: str | None = None
     debug: bool = False  # show the traceback of every error
     given: tyro.conf.Suppress[frozenset[str]] = frozenset()  # names of the options on the command line
 
@@ -64,7 +67,7 @@ def command(presets: Mapping[str, Config], workdir: str, description: str | None
     with on_one_line(debug="debug" in options(sys.argv[1:])):
         args = parse(presets, workdir, description)
         sts.enable_compilation_cache()
-        main(configure(args), args.workdir, only=args.only, skin=args.skin)
+        main(configure(args), args.workdir, only=args.only, skin=args.skin, source=args.dataset)
 
 
 def parse(presets: Mapping[str, Config], workdir: str, description: str | None) -> Args:
@@ -96,11 +99,13 @@ def with_epochs(config: Preset, given: frozenset[str]) -> Preset:
     return config
 
 
-def chosen_preset(presets: Mapping[str, Preset], words: Sequence[str]) -> Preset:
-    """The preset that `--preset` selects. For an unknown name, which tyro reports later, it is `default`."""
+def chosen_preset(
+    presets: Mapping[str, Preset], words: Sequence[str], option: str = "preset", default: str = "default"
+) -> Preset:
+    """The preset that `--preset` or another option selects. For an unknown name, which tyro reports, the default."""
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    first.add_argument("--preset", nargs="?")
-    return presets.get(first.parse_known_args(list(words))[0].preset, presets["default"])
+    first.add_argument(f"--{option}", dest="name", nargs="?")
+    return presets.get(first.parse_known_args(list(words))[0].name, presets[default])
 
 
 def configure(args: Args) -> Config:
@@ -179,7 +184,13 @@ def sensor(skin: Skin) -> sts.Sensor:
 
 
 def main(
-    config: Config, workdir: Path, *, only: Stage | None = None, own: Extensions = NONE, skin: Skin = "hazy"
+    config: Config,
+    workdir: Path,
+    *,
+    only: Stage | None = None,
+    own: Extensions = NONE,
+    skin: Skin = "hazy",
+    source: str | None = None,
 ) -> None:
     """Collect the dataset, train the models, evaluate them, and print the main table.
 
@@ -189,11 +200,15 @@ def main(
         only: Stage to run, with the results of the earlier stages in `workdir`. None: all stages.
         own: Your own loss, optimiser, logger, metrics and modalities.
         skin: Skin of the sensor that collects the dataset. The later stages use the sensor of the dataset.
+        source: Folder or URL of a finished dataset, to which `dataset` in `workdir` becomes a link. None: the dataset
+            is collected.
     """
     check(config, own)
     with storage.lock(workdir, finished=True):
         storage.claim(workdir / "config.json", dataclasses.asdict(config), storage.default_fields(config))
         folder = workdir / "dataset"
+        if source is not None:
+            link(source, config.collection, folder)
         data = collect(config.collection, sensor(skin), folder) if only in (None, "collect") else dataset.load(folder)
         if only == "collect":
             return
@@ -203,19 +218,6 @@ def main(
                 train(run, data, own)
             if only in (None, "evaluate"):
                 print(evaluate(run, data, own))
-
-
-def collect(collection: dataset.Collection, sensor: sts.Sensor, folder: Path) -> dataset.Dataset:
-    """Simulate and render what is missing of a dataset, and open it."""
-    with Bar() as bar:
-        collected = dataset.collect(
-            collection, sensor, folder, progress=lambda p: bar(f"collect: {p.stage}", p.done, p.total)
-        )
-    for line in collected.left_out:
-        say(f"collect: left out {line}")
-    if collected.resampled:
-        say(f"collect: {collected.resampled} trajectories with non-finite values or in the pad were drawn again")
-    return dataset.load(folder)
 
 
 class Job(NamedTuple):

@@ -16,6 +16,7 @@ from sts_jax import geometry, physics
 from sts_jax._checked import check_arrays, in_32_bits
 from sts_jax.dataset import records
 from sts_jax.dataset.measurement import Measurement, measured
+from sts_jax.dataset.remote import Remote, local_copy, local_or_remote
 from sts_jax.storage import (
     MANIFEST,
     DamagedFileError,
@@ -340,13 +341,15 @@ def load(folder: str | Path) -> Dataset:
     """Open and verify a dataset that `collect` has finished. The verification takes about 1 s per GB.
 
     Args:
-        folder: Folder of the dataset, or the work directory of an experiment, which has it in `dataset/`.
+        folder: Folder of the dataset, the work directory of an experiment, which has it in `dataset/`, or a URL such as
+            `s3://bucket/falls`, of which a copy is kept in the folder `datasets` of `compilation.cache_folder`.
 
     Raises:
         FileNotFoundError: The folder has no dataset, or `collect` has not finished it.
         DamagedFileError: A file is damaged, or belongs to another dataset or shard. The message names the file.
     """
-    folder = Path(folder)
+    place = local_or_remote(folder)
+    folder = local_copy(place) if isinstance(place, Remote) else place
     if folder.is_file():
         raise NotADirectoryError(f"{folder} is a file: give the folder of a collected dataset.")
     if not (folder / "collection.json").exists() and (folder / "dataset" / "collection.json").exists():

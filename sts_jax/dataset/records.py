@@ -57,13 +57,20 @@ class Images(NamedTuple):
 class _ShardFacts:
     """The facts in the manifest of a shard."""
 
-    dataset: str
+    dataset: str  # digest of the checksums of the descriptions
+    resampled: Annotated[int, pydantic.Field(ge=0)]  # number of trajectories that were discarded and sampled again
+    left_out: tuple[str, ...]  # one line for each object that the shard lacks
 
 
 def shard_files(index: int, count: int) -> tuple[str, str]:
     """Names of the image file and the array file of a shard."""
     name = f"shard-{index:05d}-of-{count:05d}"
     return f"{name}.array_record", f"{name}.npz"
+
+
+def all_files(index: int, count: int) -> tuple[str, str, str]:
+    """Names of all files of a shard, in the order in which they are written."""
+    return *shard_files(index, count), sidecar(index, count)
 
 
 def sidecar(index: int, count: int) -> str:
@@ -79,27 +86,36 @@ def remedy(folder: Path) -> str:
     )
 
 
-def finish_shard(folder: Path, dataset: str, index: int, count: int) -> None:
-    """Write the manifest of a shard, whose two files are written already. `dataset` is the digest of `described`."""
-    files = checksums(folder, shard_files(index, count))
-    write_manifest(folder, files, {"dataset": dataset}, name=sidecar(index, count))
+def finish_shard(folder: Path, dataset: str, index: int, count: int, arrays: dict[str, np.ndarray]) -> None:
+    """Write the manifest of a shard, whose two files are written already.
+
+    Args:
+        dataset: Digest of the checksums of the descriptions.
+        arrays: The arrays of the shard.
+    """
+    facts = {
+        "dataset": dataset,
+        "resampled": int(arrays["trajectory/resampled"].sum()),
+        "left_out": arrays["left_out"].tolist(),
+    }
+    write_manifest(folder, checksums(folder, shard_files(index, count)), facts, name=sidecar(index, count))
 
 
-def listed(folder: Path, dataset: str, manifest: Manifest | None, index: int, count: int) -> dict[str, str] | None:
-    """Checksums of the files of a finished shard, by name, or None if the shard is not finished.
+def shard_manifest(folder: Path, dataset: str, manifest: Manifest | None, index: int, count: int) -> Manifest | None:
+    """The manifest of a finished shard, or None if the shard is not finished.
 
     Args:
         dataset: As in `finish_shard`.
-        manifest: The manifest of the dataset, or None if there is none yet.
+        manifest: The manifest of the dataset. It lists shards that have no manifest of their own, without facts.
     """
     files, name = shard_files(index, count), sidecar(index, count)
     shard = read_manifest(folder, remedy(folder), _ShardFacts, name=name)
     if shard is not None:
         if tuple(shard.files) != files or shard.facts["dataset"] != dataset:
             raise DamagedFileError(f"{folder / name} is that of another shard or dataset: {remedy(folder)}.")
-        return shard.files
+        return shard
     if manifest is not None and all(file in manifest.files for file in files):
-        return {file: manifest.files[file] for file in files}
+        return Manifest({file: manifest.files[file] for file in files}, {})
     return None
 
 

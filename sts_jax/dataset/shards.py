@@ -3,6 +3,7 @@
 A shard is a pure function of the `Collection`, the sensor and its index, so any process can make it, and make it again.
 """
 
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -15,6 +16,7 @@ from sts_jax import objects, physics
 from sts_jax._checked import in_32_bits
 from sts_jax.dataset import records
 from sts_jax.dataset.collection import Collection, class_names, make_bodies
+from sts_jax.dataset.remote import Remote
 from sts_jax.dataset.rendering import render
 from sts_jax.sensor import Sensor
 from sts_jax.storage import write_arrays
@@ -37,8 +39,7 @@ def simulate_shard(collection: Collection, sensor: Sensor, index: int, report: C
     Args:
         report: Called with the number of finished trajectories of the shard.
     """
-    first = index * collection.objects_per_shard
-    members = np.arange(first, min(first + collection.objects_per_shard, collection.num_objects))
+    members = _members(collection, index)
     key = jax.random.fold_in(jax.random.key(collection.seed), collection.num_objects + index)
     made, left_out = _made(collection, members)
     simulated, trajectory, failed = _simulated(collection, sensor, key, made, report)
@@ -59,23 +60,44 @@ def simulate_shard(collection: Collection, sensor: Sensor, index: int, report: C
 def write_shard(
     collection: Collection,
     sensor: Sensor,
-    folder: Path,
+    target: Path | Remote,
     dataset: str,
     index: int,
     simulated: Simulated,
     report: Callable[[int], None],
 ) -> None:
-    """Render a shard and write its files into a folder, its manifest last.
+    """Render a shard and write its files, its manifest last.
 
     Args:
         dataset: See `records.finish_shard`.
         report: Called with the number of finished frames and views of the shard.
     """
-    images, table = records.shard_files(index, collection.num_shards)
+    if isinstance(target, Remote):
+        with tempfile.TemporaryDirectory() as folder:
+            write_shard(collection, sensor, Path(folder), dataset, index, simulated, report)
+            target.put(Path(folder), records.all_files(index, collection.num_shards))
+        return
+    images, table, _ = records.all_files(index, collection.num_shards)
     bodies, trajectory, frames, views, arrays = simulated
-    records.write_images(folder / images, render(collection, sensor, bodies, trajectory, frames, views, report))
-    write_arrays(folder / table, arrays)
-    records.finish_shard(folder, dataset, index, collection.num_shards)
+    records.write_images(target / images, render(collection, sensor, bodies, trajectory, frames, views, report))
+    write_arrays(target / table, arrays)
+    records.finish_shard(target, dataset, index, collection.num_shards, arrays)
+
+
+def planned(collection: Collection, index: int) -> tuple[int, int]:
+    """Numbers of trajectories and of frames and views of a shard, if none of its objects is left out."""
+    members, length = _members(collection, index), collection.scenario.frames
+    first, objects = int(members[0]), len(members)
+    ranks = collection.num_full - np.arange(collection.rendered_per_object) * collection.num_objects - first
+    full = int(np.clip(ranks, 0, objects).sum())
+    ends = objects * collection.rendered_per_object - full
+    return objects * collection.num_per_object, full * length + 2 * ends + objects * collection.num_views
+
+
+def _members(collection: Collection, index: int) -> np.ndarray:
+    """Indices of the objects of a shard in the collection."""
+    first = index * collection.objects_per_shard
+    return np.arange(first, min(first + collection.objects_per_shard, collection.num_objects))
 
 
 def _simulated(
