@@ -80,11 +80,11 @@ class Row(NamedTuple):
 
 
 def build(sensor: sts.Sensor, body: objects.Body | None = None) -> mujoco.MjModel:
-    """A gripper with two sensors, cameras at the sensors' pinholes, the object, and two further bodies on the table."""
+    """A gripper with two sensors, cameras at the sensors' pinholes, the object, and a body on each side of it."""
     spec = scene.gripper(sensor, body)
     for name, kind, size, y in (
-        ("ball", mujoco.mjtGeom.mjGEOM_SPHERE, [0.015, 0, 0], 0.1),
-        ("block", mujoco.mjtGeom.mjGEOM_BOX, [0.02, 0.02, 0.03], -0.1),
+        ("ball", mujoco.mjtGeom.mjGEOM_SPHERE, [0.012, 0, 0], 0.038),
+        ("block", mujoco.mjtGeom.mjGEOM_BOX, [0.012, 0.01, 0.03], -0.038),
     ):
         other = spec.worldbody.add_body(name=name, pos=[0, y, size[2] or size[0]])
         other.add_geom(name=name, type=kind, size=size, rgba=[0.2, 0.45, 0.7, 1])
@@ -297,6 +297,8 @@ def pictures() -> list[Path]:
     for engine, title in (("c", "C MuJoCo"), ("mjx", "MJX")):
         figure, axes = plt.subplots(3, 5, figsize=(9, 5.8), layout="constrained")
         for row, (moment, data) in zip(axes, zip(MOMENTS, grasp(model, engine), strict=True), strict=True):
+            numbers = " ".join(f"{number:.3f}" for number in view.wrenches(data)["left"]["object"])
+            print(f"{title}, {moment}: the left pad presses on the object with {numbers} (N, N m)")
             frames = view(data, resolution=(180, 180))
             whole = merged(model, data, -1, {"object": body})
             outside = optics.photograph(

@@ -92,6 +92,25 @@ def test_a_sheet_shows_all_classes(tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().out.count("deepest imprint") == 2
 
 
+def test_markers_move_under_a_force_and_a_moment_that_friction_carries(box, tmp_path, capsys):
+    config = sense.Config(str(box), out=tmp_path / "box.png", resolution=TINY, mass=0.1, markers=0.01)
+    sense.main(config)
+    loads = re.search(
+        r"0.981 N down, and ([\d.]+) N to the right, and ([\d.]+) N m about the vertical: the skin moves by up to "
+        r"([\d.]+) mm, balanced",
+        capsys.readouterr().out,
+    )
+    assert loads is not None
+    assert float(loads[1]) == pytest.approx(0.8 * 0.8 * 0.981, rel=0.01)  # share, friction, weight
+    # The mean distance of the points of a 40 x 30 mm rectangle from its centre is 13.5 mm.
+    assert float(loads[2]) == pytest.approx(float(loads[1]) * 0.0135, rel=0.02)
+    assert 0 < float(loads[3]) < 2
+    with Image.open(tmp_path / "box.png") as picture:
+        assert picture.size == (1020, 840)
+    with pytest.raises(ValueError, match="--markers needs a contact, but the force is 0 N: give a larger --force"):
+        sense.main(dataclasses.replace(config, force=0.0))
+
+
 def test_a_sensor_of_a_file_is_used(box, tmp_path, capsys):
     sensor, path = sts.Sensor(), tmp_path / "soft.json"
     dataclasses.replace(sensor, gel=dataclasses.replace(sensor.gel, stiffness=1e6)).save(path)

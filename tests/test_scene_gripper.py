@@ -69,6 +69,25 @@ def test_fingers_press_with_the_grip_force_and_carry_the_weight(name):
     np.testing.assert_allclose(data.qpos[1], data.qpos[2], atol=2e-5)
 
 
+def test_a_mean_over_twenty_steps_steadies_force_and_place_of_a_chattering_contact():
+    body = sts.objects.make(jax.random.key(0), "camera")
+    model, data = with_pads(scene.gripper(SENSOR, body, mass=0.12, friction=0.5, grip=6.0, yaw=np.pi / 2))
+    lift(model, data)
+    rows = np.zeros((600, 2, 6))
+    for row in rows:
+        mujoco.mj_step(model, data)
+        row[:] = [wrench(model, data, side, f"{side}_tip") for side in ("left", "right")]
+    spread = []
+    for number in (1, 20):
+        mean = np.stack([rows[end - number : end].mean(axis=0) for end in range(20, len(rows))])
+        force, place = mean[..., 2], mean[..., 3:5] / mean[..., 2:3]
+        spread.append([force.std(axis=0).max(), np.linalg.norm(place.std(axis=0), axis=-1).max()])
+    momentary, averaged = spread
+    assert momentary[0] > 0.02 * 6  # N
+    assert averaged[0] < momentary[0] / 5
+    assert averaged[1] < momentary[1] / 5
+
+
 @pytest.mark.parametrize(("share", "held"), [(0.9, True), (1.1, False)])
 def test_a_lift_holds_if_friction_carries_the_weight(share, held):
     """Two fingers carry at most 2 mu F."""

@@ -124,6 +124,20 @@ def test_what_touches_leaves_an_imprint_and_what_does_not_leaves_none(objects):
     np.testing.assert_allclose(frame.pose[1:, :3], [place for place, *_ in list(OBJECTS.values())[1:]], atol=1e-6)
 
 
+def test_given_wrenches_replace_those_of_the_data(objects):
+    _, data, view, frame = objects
+    wrenches = view.wrenches(data)
+    half = jax.tree.map(lambda wrench: wrench / 2, wrenches)
+    np.testing.assert_array_equal(view(data, wrenches=wrenches, resolution=SIZE)["pad"].tactile, frame.tactile)
+    flatter = view(data, wrenches=half, resolution=SIZE)["pad"]
+    np.testing.assert_allclose(flatter.pressure.sum(), frame.pressure.sum() / 2, rtol=0.01)
+    for bad in ({}, {"pad": {}}, {"other": wrenches["pad"]}):
+        with pytest.raises(
+            ValueError, match=r"wrenches must have the pads \['pad'\], and for the pad 'pad' the bodies"
+        ):
+            view(data, wrenches=bad)
+
+
 @pytest.mark.slow
 def test_a_batch_of_mjx_data_under_jit_gives_the_same_frames(objects):
     model, data, view, frame = objects

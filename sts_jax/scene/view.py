@@ -114,11 +114,19 @@ class View:
 
     @in_32_bits
     @checked
-    def __call__(self, data: mujoco.MjData | mjx.Data, *, resolution: tuple[int, int] = (64, 64)) -> dict[str, Frame]:
+    def __call__(
+        self,
+        data: mujoco.MjData | mjx.Data,
+        *,
+        wrenches: Mapping[str, Mapping[str, Float[Array | np.ndarray, "6"]]] | None = None,
+        resolution: tuple[int, int] = (64, 64),
+    ) -> dict[str, Frame]:
         """Render the images of all sensors.
 
         Args:
             data: Data after a step, or after `mj_forward`. For a batch use `jax.vmap`.
+            wrenches: What presses on each pad, in the form of `View.wrenches`, such as a mean over the last steps.
+                None: the wrenches of `data`.
             resolution: Height and width of the images (pixels).
 
         Returns:
@@ -127,10 +135,12 @@ class View:
         """
         if not all(1 <= side <= MOST_PIXELS for side in resolution):
             raise ValueError(f"resolution (height, width) must be from 1 to {MOST_PIXELS:,} pixels, got {resolution}")
+        given = self._given(wrenches)
         arrays, frames = self._read(data), {}
         for name, pad in self._pads.items():
-            poses, wrenches = _poses(arrays, pad.site, pad.bodies), _felt(arrays, pad, pad.bodies)
-            drawn = draw_group(pad.sensor, pad.group, poses, wrenches, resolution=resolution)
+            poses = _poses(arrays, pad.site, pad.bodies)
+            felt = _felt(arrays, pad, pad.bodies) if given is None else given[name]
+            drawn = draw_group(pad.sensor, pad.group, poses, felt, resolution=resolution)
             body = jnp.where(drawn.body < 0, -1, jnp.asarray(pad.names)[drawn.body])
             frames[name] = Frame(**drawn._replace(body=body)._asdict())
         return frames
@@ -145,6 +155,26 @@ class View:
             rows = zip(bodies.tolist(), _felt(arrays, pad, bodies), strict=True)
             wrenches[name] = {self._names[body]: row for body, row in rows}
         return wrenches
+
+    def _given(self, wrenches: Mapping[str, Mapping[str, Any]] | None) -> dict[str, Float[Array, "k 6"]] | None:
+        """Wrenches in the order of the bodies that each pad can see."""
+        if wrenches is None:
+            return None
+        for name, pad in self._pads.items():
+            wanted = {self._names[body] for body in pad.contacts.bodies}
+            if wrenches.keys() != self._pads.keys() or wrenches[name].keys() != wanted:
+                raise ValueError(
+                    f"wrenches must have the pads {sorted(self._pads)}, and for the pad {name!r} the bodies "
+                    f"{sorted(wanted)}, got { ({pad: sorted(bodies) for pad, bodies in wrenches.items()}) }: give what "
+                    "view.wrenches(data) returns, or its mean"
+                )
+        nothing = jnp.zeros(6)
+        return {
+            name: jnp.stack(
+                [jnp.asarray(wrenches[name].get(self._names[body], nothing), jnp.float32) for body in pad.bodies]
+            )
+            for name, pad in self._pads.items()
+        }
 
     def _read(self, data: Any) -> "_Arrays":
         """The public arrays of MuJoCo's data, in 32 bits."""
