@@ -13,11 +13,11 @@ ROOMS = [
     for name, paths, lines, budget in re.findall(r"^\| ([^|`]+) \| (`[^|]+) \| ([\d,]+) \| ([\d,]+) \|$", PAGE, re.M)
 ]
 TOTALS = {
-    "library without hardware": 23_830,
+    "library without hardware": 24_850,
     "hardware": 5_080,
-    "experiments": 5_880,
-    "benchmarks": 5_350,
-    "tests": 22_740,
+    "experiments": 6_200,
+    "benchmarks": 5_600,
+    "tests": 23_300,
 }
 
 
