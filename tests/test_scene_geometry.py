@@ -86,10 +86,12 @@ def test_visual_geoms_are_drawn_where_a_body_has_them_and_groups_can_be_chosen()
     model, _ = compiled(
         f'<geom {GEOMS["box"]} group="3"/><geom {visual}/><geom {visual} rgba="1 1 1 0"/>'
         f'<body><geom {GEOMS["box"]} group="3"/></body>'
+        # A sticker on a box does not hide the box, which MuJoCo's viewer shows as well.
+        f'<body><geom {GEOMS["box"]} group="2"/><geom {GEOMS["box"]} group="3"/><geom {visual}/></body>'
     )
-    np.testing.assert_array_equal(geometry.visible(model, None), [1, 3])
-    np.testing.assert_array_equal(geometry.visible(model, [3]), [0, 3])
-    np.testing.assert_array_equal(geometry.visible(model, [2]), [1])
+    np.testing.assert_array_equal(geometry.visible(model, None), [1, 3, 4, 6])
+    np.testing.assert_array_equal(geometry.visible(model, [3]), [0, 3, 5])
+    np.testing.assert_array_equal(geometry.visible(model, [2]), [1, 4, 6])
 
 
 def test_the_default_colour_gives_way_to_that_of_the_material():

@@ -40,15 +40,16 @@ class Surface(NamedTuple):
 def visible(model: mujoco.MjModel, groups: Iterable[int] | None) -> Int[np.ndarray, "k"]:
     """Ids of the geoms that are drawn.
 
-    With `groups`, all geoms of these groups. Else the visual geoms of each body, which collide with nothing, or all its
-    geoms if none is visual. Geoms with opacity 0 are never drawn.
+    With `groups`, all geoms of these groups. Else the visual geoms of each body, which collide with nothing, and the
+    geoms of this body in the same groups, or all its geoms if none is visual. Geoms with opacity 0 are never drawn.
     """
     opaque = np.array([rgba(model, geom)[3] > 0 for geom in range(model.ngeom)], bool)
     if groups is not None:
         return np.flatnonzero(opaque & np.isin(model.geom_group, list(groups)))
     visual = opaque & (model.geom_contype == 0) & (model.geom_conaffinity == 0)
     has_visual = np.isin(model.geom_bodyid, model.geom_bodyid[visual])
-    return np.flatnonzero(visual | (opaque & ~has_visual))
+    place = model.geom_bodyid * (1 + model.geom_group.max(initial=0)) + model.geom_group
+    return np.flatnonzero(opaque & (np.isin(place, place[visual]) | ~has_visual))
 
 
 def body_of(model: mujoco.MjModel, geoms: Iterable[int] | Int[np.ndarray, "k"]) -> Body:

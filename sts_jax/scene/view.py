@@ -80,7 +80,7 @@ class View:
             bodies: Bodies that are drawn in place of the geoms of a MuJoCo body, by its name. Their mesh frame is the
                 frame of the MuJoCo body.
             groups: Groups of geoms that are drawn. None: the visual geoms of each body (`contype` and `conaffinity` are
-                0), or all its geoms if it has no visual ones.
+                0) and its geoms in the same groups, or all its geoms if it has no visual ones.
             hide: Names of bodies and geoms that are not drawn. Flexes, which are neither drawn nor felt, must be named.
         """
         if not sensors:
