@@ -197,7 +197,7 @@ class Dataset:
 
     def ends(self, trajectories: np.ndarray) -> Ends:
         """Return the first and last poses of trajectories, which need no images. `trajectories` is int `(n,)`."""
-        index = self._checked(trajectories)
+        index = self.checked(trajectories)
         return Ends(
             pose=self.trajectory["pose"][index][:, [0, -1]],
             condition=self.trajectory["condition"][index],
@@ -220,8 +220,8 @@ class Dataset:
         pose, support, mass, com = (self.view[name][rows] for name in ("pose", "support", "mass", "com"))
         return Views(visual, pose, support, mass, com, self.view["body"][rows].astype(np.int64))
 
-    def _checked(self, trajectories: Any) -> np.ndarray:
-        """Return indices of trajectories as int64, or raise a ValueError if one is invalid."""
+    def checked(self, trajectories: Any) -> np.ndarray:
+        """Return indices of trajectories as int64 `(n,)`, or raise a ValueError if one is invalid."""
         trajectories, count = np.asarray(trajectories), len(self.trajectory["outcome"])
         if trajectories.ndim != 1 or (trajectories.size and trajectories.dtype.kind not in "iu"):
             raise ValueError(
@@ -255,7 +255,7 @@ class Dataset:
             trajectories: Indices of the trajectories, int `(n,)`.
             stride: Number of frames from the first to the second frame of each row.
         """
-        index, length = self._checked(trajectories), self.trajectory["time"].shape[1]
+        index, length = self.checked(trajectories), self.trajectory["time"].shape[1]
         if not isinstance(stride, int | np.integer) or not 1 <= stride < length:
             raise ValueError(
                 f"stride is {stride!r}, but it must be a whole number from 1 to {length - 1}, because the trajectories "
@@ -286,7 +286,7 @@ class Dataset:
                 `full_trajectories` only.
             measurements: Further modalities to measure, for the first and last frames only.
         """
-        index = self._checked(trajectories)
+        index = self.checked(trajectories)
         without = index[~np.isin(index, self.rendered())]
         if without.size:
             raise ValueError(
@@ -337,12 +337,14 @@ class Dataset:
         return both % length
 
 
-def load(folder: str | Path) -> Dataset:
+def load(folder: str | Path, *, shards: Sequence[int] | None = None) -> Dataset:
     """Open and verify a dataset that `collect` has finished. The verification takes about 1 s per GB.
 
     Args:
         folder: Folder of the dataset, the work directory of an experiment, which has it in `dataset/`, or a URL such as
             `s3://bucket/falls`, of which a copy is kept in the folder `datasets` of `compilation.cache_folder`.
+        shards: Indices of the shards to read and verify, for datasets of which not even the poses fit in memory. The
+            trajectories are numbered from 0 in the first of them. None: all.
 
     Raises:
         FileNotFoundError: The folder has no dataset, or `collect` has not finished it.
@@ -362,12 +364,15 @@ def load(folder: str | Path) -> Dataset:
     if manifest is None:
         raise FileNotFoundError(f"{folder} is not a collected dataset: give another folder, or call `collect`.")
     count = manifest.facts["shards"]
-    files = [records.shard_files(index, count) for index in range(count)]
+    if any(not 0 <= index < count for index in shards or ()):
+        raise ValueError(f"shards is {shards!r}, but {folder} has the shards 0 to {count - 1}")
+    files = [records.shard_files(index, count) for index in (range(count) if shards is None else shards)]
     for name in (name for both in files for name in both if name not in manifest.files):
         raise FileNotFoundError(
             f"{folder / name} is missing: the collection is not finished. Call `collect` to continue it."
         )
-    verify(folder, manifest, records.remedy(folder))
+    names = None if shards is None else [*records.DESCRIPTIONS, *(name for both in files for name in both)]
+    verify(folder, manifest, records.remedy(folder), names)
     collection, split = _descriptions(folder)
     parts = [_table(folder / table, collection["num_objects"]) for _, table in files]
     starts = np.cumsum([0] + [len(part["trajectory/outcome"]) for part in parts])
@@ -384,9 +389,9 @@ def load(folder: str | Path) -> Dataset:
         },
         frames=np.concatenate([p["frames"] + np.array([s, 0]) for p, s in zip(parts, starts[:-1], strict=True)]),
         shards=tuple(folder / images for images, _ in files),
-        shard_of=np.repeat(np.arange(count), sizes),
+        shard_of=np.repeat(np.arange(len(files)), sizes),
         record_of=np.concatenate([np.arange(size) for size in sizes]),
-        view_shard_of=np.repeat(np.arange(count), views),
+        view_shard_of=np.repeat(np.arange(len(files)), views),
         view_record_of=np.concatenate([size + np.arange(k) for size, k in zip(sizes, views, strict=True)]),
     )
 
