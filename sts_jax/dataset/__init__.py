@@ -9,6 +9,7 @@ from sts_jax.dataset.collection import as_json as as_json
 from sts_jax.dataset.collection import class_names as class_names
 from sts_jax.dataset.collection import make_bodies as make_bodies
 from sts_jax.dataset.collection import split_objects as split_objects
+from sts_jax.dataset.items import Items as Items
 from sts_jax.dataset.loading import Dataset as Dataset
 from sts_jax.dataset.loading import Ends as Ends
 from sts_jax.dataset.loading import Pairs as Pairs

@@ -189,8 +189,6 @@ def _exported(
 
 def _planned(folder: Path, frames: Frames, progress: Callable[[Progress], None] | None) -> _Job:
     """Verify the dataset, and list what is exported."""
-    if frames not in ("all", "ends"):
-        raise ValueError(f"frames is {frames!r}, but it must be 'all' or 'ends'")
     data = load(folder, shards=[0])
     count = math.ceil(data.collection["num_objects"] / data.collection["objects_per_shard"])
     time, ends = data.trajectory["time"][0], _frames(data, frames)
@@ -316,7 +314,7 @@ class _ParquetFiles:
     """Parquet files of limited size. An episode is in one file."""
 
     def __init__(self, folder: Path, name: str) -> None:
-        """Write to a folder, to files whose names have the numbers of `_numbered`."""
+        """Write to a folder, to files whose names have their index or the numbers of `_numbered`."""
         self._folder, self._name, self.index = folder, name, -1
         self._writer: Any = None
         self._tables: list[Any] = []
@@ -329,7 +327,7 @@ class _ParquetFiles:
         if self._writer is None or (starts and self._size + size > _FILE):
             self.close()
             self.index += 1
-            path = self._folder / self._name.format(**_numbered("", self.index))
+            path = self._folder / self._name.format(index=self.index, **_numbered("", self.index))
             path.parent.mkdir(parents=True, exist_ok=True)
             texts = [field.name for field in table.schema if str(field.type) == "string"]
             self._writer = pq.ParquetWriter(path, table.schema, compression="snappy", use_dictionary=texts)
@@ -377,7 +375,7 @@ def _parquet(folder: Path, job: _Job) -> None:
     files: dict[str, _ParquetFiles] = {}
     for batch in _batches(job):
         if batch.part not in files:
-            files[batch.part] = _ParquetFiles(folder / "data", f"{batch.part}-{{file_index:05d}}")
+            files[batch.part] = _ParquetFiles(folder / "data", f"{batch.part}-{{index:05d}}")
         images = {stream: _encoded(batch.images[stream]) for stream in STREAMS}
         size = sum(len(data) for stream in images.values() for data in stream)
         files[batch.part].add(_table(images, batch.values), size, batch.starts)

@@ -158,8 +158,12 @@ class Dataset:
             for whole, piece in zip(out, shards[shard].images(self.record_of[rows[here]]), strict=True):
                 whole[here] = piece
 
-        with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
-            list(pool.map(read, np.unique(self.shard_of[rows]).tolist()))
+        needed = np.unique(self.shard_of[rows]).tolist()
+        if len(needed) == 1:  # threads would take longer than the reading
+            read(needed[0])
+        else:
+            with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+                list(pool.map(read, needed))
         return out
 
     def _opened(self, shard: int) -> records.Shard:
