@@ -13,11 +13,11 @@ ROOMS = [
     for name, paths, lines, budget in re.findall(r"^\| ([^|`]+) \| (`[^|]+) \| ([\d,]+) \| ([\d,]+) \|$", PAGE, re.M)
 ]
 TOTALS = {
-    "library without hardware": 24_850,
+    "library without hardware": 25_550,
     "hardware": 5_080,
-    "experiments": 6_200,
+    "experiments": 6_300,
     "benchmarks": 5_600,
-    "tests": 23_300,
+    "tests": 23_900,
 }
 
 
