@@ -10,6 +10,7 @@ import signal
 import time
 from pathlib import Path
 
+import fsspec
 import native_dataset
 import numpy as np
 import pyarrow as pa
@@ -301,6 +302,14 @@ def test_a_condition_that_the_scenario_does_not_describe_is_kept_as_it_is(tmp_pa
     )
 
 
+def test_a_dataset_behind_a_url_is_exported(native, tmp_path, monkeypatch):
+    monkeypatch.setattr("sts_jax.dataset.remote.cache_folder", lambda: tmp_path / "cache")
+    files = fsspec.filesystem("memory")
+    files.put(f"{native[0]}/*", "/export/falls/")
+    assert export.to_png("memory://export/falls", tmp_path / "out") == export.to_png(native[0], tmp_path / "local")
+    assert (tmp_path / "out/frames.csv").read_bytes() == (tmp_path / "local/frames.csv").read_bytes()
+
+
 def _export_slowly(folder, target, name):
     export.FORMATS[name](folder, target, progress=lambda now: time.sleep(60) if now.done > now.total / 2 else None)
 
@@ -369,8 +378,8 @@ def test_a_full_disk_is_named_and_leaves_nothing(native, tmp_path, monkeypatch):
 
 
 def test_the_command_states_what_is_left_out(native, tmp_path):
-    line = command.main(command.Args(native[0], "png", tmp_path / "out"))
+    line = command.main(command.Args(str(native[0]), "png", tmp_path / "out"))
     assert line.startswith(f"{tmp_path / 'out'}: 90 frames of 15 trajectories. 6 trajectories are left out")
-    assert command.main(command.Args(native[0], "png", tmp_path / "ends", "ends")).endswith(
+    assert command.main(command.Args(str(native[0]), "png", tmp_path / "ends", "ends")).endswith(
         "42 frames of 21 trajectories"
     )

@@ -23,6 +23,7 @@ from sts_jax.dataset.collection import PARTS
 from sts_jax.dataset.items import frame_fields, trajectory_fields
 from sts_jax.dataset.loading import Dataset, load
 from sts_jax.dataset.records import Shard
+from sts_jax.dataset.remote import Remote, local_copy, local_or_remote
 from sts_jax.physics.scenario import in_words
 from sts_jax.storage import DamagedFileError, lock, read_json, remedy, write_json
 
@@ -92,14 +93,14 @@ class _Batch(NamedTuple):
 
 
 def to_lerobot(
-    folder: Path, target: Path, *, frames: Frames = "all", progress: Callable[[Progress], None] | None = None
+    folder: str | Path, target: Path, *, frames: Frames = "all", progress: Callable[[Progress], None] | None = None
 ) -> Exported:
     """Export a dataset to a folder in the format of LeRobotDataset v3.0, with images as PNG files inside Parquet.
 
     Needs the extra `export`. The poses are `observation.state`. There are no actions.
 
     Args:
-        folder: Folder of a finished dataset.
+        folder: Folder or URL of a finished dataset, as for `dataset.load`.
         target: Folder of the export. If it exists, it must have the same export already.
         frames: "all" exports the trajectories with images of all frames, and "ends" the first and the last frames of
             all trajectories with images.
@@ -110,7 +111,7 @@ def to_lerobot(
 
 
 def to_oxt(
-    folder: Path, target: Path, *, frames: Frames = "all", progress: Callable[[Progress], None] | None = None
+    folder: str | Path, target: Path, *, frames: Frames = "all", progress: Callable[[Progress], None] | None = None
 ) -> Exported:
     """Export a dataset in the Zarr format (version 2) of Open-X-Tactile and FTP-1. Arguments as for `to_lerobot`.
 
@@ -121,7 +122,7 @@ def to_oxt(
 
 
 def to_parquet(
-    folder: Path, target: Path, *, frames: Frames = "all", progress: Callable[[Progress], None] | None = None
+    folder: str | Path, target: Path, *, frames: Frames = "all", progress: Callable[[Progress], None] | None = None
 ) -> Exported:
     """Export a dataset to Parquet files for `datasets.load_dataset`. Arguments as for `to_lerobot`."""
     _need("pyarrow")
@@ -129,7 +130,7 @@ def to_parquet(
 
 
 def to_png(
-    folder: Path, target: Path, *, frames: Frames = "all", progress: Callable[[Progress], None] | None = None
+    folder: str | Path, target: Path, *, frames: Frames = "all", progress: Callable[[Progress], None] | None = None
 ) -> Exported:
     """Export a dataset to PNG files and the table `frames.csv`. Arguments as for `to_lerobot`."""
     return _exported("png", _png, folder, target, frames, progress)
@@ -147,14 +148,14 @@ def _need(package: str) -> None:
 def _exported(
     name: str,
     write: Callable[[Path, _Job], None],
-    folder: Path,
+    folder: str | Path,
     target: Path,
     frames: Frames,
     progress: Callable[[Progress], None] | None,
 ) -> Exported:
     """Write an export into a folder with another name, and rename it when it is complete."""
-    folder, target = Path(folder), Path(target).absolute()
-    job = _planned(folder, frames, progress)
+    place, target = local_or_remote(folder), Path(target).absolute()
+    job = _planned(local_copy(place) if isinstance(place, Remote) else place, frames, progress)
     record = {"format": name, "frames": frames, "dataset": job.identity}
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         recorded = read_json(target / RECORD, "choose another folder") if (target / RECORD).exists() else None
