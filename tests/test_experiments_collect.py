@@ -36,11 +36,11 @@ def test_options_replace_single_fields(monkeypatch, tmp_path):
     monkeypatch.setattr(collect, "make", lambda *args, **options: made.append((args, options)))
     words = "--scenario perturbed --preset smoke --num-objects 3 --num-per-object 5 --resolution 1232 1640"
     for frames, full in (("all", 15), ("ends", 0)):
-        more = f"--frames {frames} --scenario.height 0.07 --process-index 1 --process-count 4 --out {tmp_path}"
+        more = f"--frames {frames} --scenario.rate 20 --process-index 1 --process-count 4 --out {tmp_path}"
         collect.main(collect.parse(f"{words} {more}".split()))
         (one, _, out), options = made.pop()
         assert (one.num_objects, one.num_per_object, one.resolution, one.num_full) == (3, 5, (1232, 1640), full)
-        assert isinstance(one.scenario, sts.physics.Perturbed)
+        assert one.scenario == sts.physics.Perturbed(rate=20)
         assert out == str(tmp_path)
         assert options == {"process_index": 1, "process_count": 4, "cluster": None, "repair": False}
     with pytest.raises(SystemExit):

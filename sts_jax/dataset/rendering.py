@@ -1,7 +1,9 @@
 """Rendering of a dataset on all CPU cores: images as `uint8` arrays, and segmentations as bool arrays."""
 
+import collections
 import concurrent.futures
 import functools
+import itertools
 import os
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
@@ -72,9 +74,13 @@ def render(
         kept = images[:1] if job.is_view else images
         return tuple(np.asarray(leaf)[: len(job.pose)] for leaf in kept)
 
-    done = 0
-    with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
-        for images in pool.map(work, jobs()):
+    done, todo, workers = 0, jobs(), os.cpu_count() or 1
+    with concurrent.futures.ThreadPoolExecutor(workers) as pool:
+        # A few jobs ahead: large images would fill the memory if the disk is slower than the rendering.
+        pending = collections.deque(pool.submit(work, job) for job in itertools.islice(todo, 2 * workers))
+        while pending:
+            images = pending.popleft().result()
+            pending.extend(pool.submit(work, job) for job in itertools.islice(todo, 1))
             done += len(images[0])
             report(done)
             yield images
