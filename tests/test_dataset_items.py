@@ -146,6 +146,6 @@ def test_the_pytorch_dataset_of_the_page(native, data):
     exec(code, names)
     falls = names["Falls"](native[0], "test")
     batch = next(iter(torch.utils.data.DataLoader(falls, batch_size=3)))
-    first = data.members("test")[0]
+    first = int(data.members("test")[0])
     assert batch["trajectory"].tolist() == [first] * 3
     np.testing.assert_array_equal(batch["visual"].numpy(), data.strip(first).visual[:3])
