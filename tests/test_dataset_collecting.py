@@ -441,3 +441,17 @@ def test_a_folder_of_another_collection_or_another_process_is_refused(copied):
             dataset.collect(SMALL, sts.Sensor(), copied, process_index=asked[0], process_count=asked[1])
     with pytest.raises(ValueError, match=r"process_index must be from 0 to process_count - 1 = 1, got 2"):
         dataset.collect(SMALL, sts.Sensor(), copied, process_index=2, process_count=2)
+
+
+def test_a_finished_dataset_has_a_card_that_its_owner_can_edit(folder, tmp_path):
+    out = shutil.copytree(folder, tmp_path / "dataset")
+    path, identity = out / "README.md", dataset.load(out).identity
+    tables = [np.load(out / f"{shard}.npz") for shard in SHARDS]
+    split = dataset.split_objects(SMALL)
+    assert path.read_text() == dataset.card(SMALL, sts.Sensor(), split, tables, version=sts.__version__)
+    path.write_text("mine")
+    assert dataset.load(out).identity == identity
+    dataset.collect(SMALL, sts.Sensor(), out)
+    assert path.read_text() == "mine"
+    path.unlink()
+    assert dataset.load(out).identity == identity

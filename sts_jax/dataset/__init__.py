@@ -1,5 +1,7 @@
 """Datasets on disk: `collect` simulates, renders and writes them, and `load` reads them as arrays."""
 
+from sts_jax.dataset.card import card as card
+from sts_jax.dataset.card import quantities as quantities
 from sts_jax.dataset.collecting import Collected as Collected
 from sts_jax.dataset.collecting import Progress as Progress
 from sts_jax.dataset.collecting import collect as collect
@@ -24,3 +26,7 @@ from sts_jax.dataset.records import Images as Images
 from sts_jax.dataset.rendering import empty_frame as empty_frame
 from sts_jax.dataset.rendering import frames_per_call as frames_per_call
 from sts_jax.dataset.rendering import render_uint8 as render_uint8
+from sts_jax.dataset.suspects import KINDS as KINDS
+from sts_jax.dataset.suspects import Suspect as Suspect
+from sts_jax.dataset.suspects import find_suspects as find_suspects
+from sts_jax.dataset.suspects import find_untouched as find_untouched

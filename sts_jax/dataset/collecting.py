@@ -10,8 +10,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
+import sts_jax
 from sts_jax._checked import in_32_bits
 from sts_jax.dataset import cluster, records
+from sts_jax.dataset.card import CARD, card
 from sts_jax.dataset.collection import Collection, as_json, split_objects
 from sts_jax.dataset.remote import Remote, local_or_remote
 from sts_jax.dataset.shards import Simulated, planned, simulate_shard, write_shard
@@ -30,6 +34,7 @@ from sts_jax.storage import (
     read_manifest,
     sha256,
     verify,
+    write_bytes,
     write_json,
     write_manifest,
 )
@@ -94,7 +99,8 @@ def collect(
         collection: The description of the dataset.
         sensor: The sensor for the simulation and the images.
         folder: The folder of the dataset, or a URL such as `s3://bucket/falls`, for which fsspec may need a driver. It
-            receives the shards, `collection.json`, `sensor.json` (for `Sensor.load`), `split.json` and `manifest.json`.
+            receives the shards, `collection.json`, `sensor.json` (for `Sensor.load`), `split.json`, a data card
+            (`README.md`) and `manifest.json`.
         process_index: Index of this process, from 0.
         process_count: Number of the processes that share the work.
         cluster: Address of a Dask scheduler, such as `tcp://10.0.0.1:8786`, whose workers make the shards (needs the
@@ -330,8 +336,30 @@ def _complete(work: _Work, folder: Path, dataset: str, manifest: Manifest | None
         delete_partial(folder)  # of killed processes
         return shards
     delete_partial(folder, "shard-")
-    # A data card of the whole dataset is written here, before the manifest, and uploaded with it.
+    _write_card(work, folder)
     write_manifest(folder, files, {"shards": count})
     if isinstance(work.target, Remote):
         work.target.put(folder, [MANIFEST])
     return shards
+
+
+def _write_card(work: _Work, folder: Path) -> None:
+    """Write the data card of a dataset that has none. The manifest does not list it, so that its owner can edit it."""
+    if CARD in (work.target.names() if isinstance(work.target, Remote) else os.listdir(folder)):
+        return
+    split, tables = split_objects(work.collection), _tables(work, folder)
+    text = card(work.collection, work.sensor, split, tables, version=sts_jax.__version__)
+    write_bytes(folder / CARD, text.encode())
+    if isinstance(work.target, Remote):
+        work.target.put(folder, [CARD])
+
+
+def _tables(work: _Work, folder: Path) -> Iterator[dict[str, np.ndarray]]:
+    """The arrays of each shard, one after another, so that only one is in memory and on the local disk."""
+    for index in range(work.collection.num_shards):
+        path = folder / work.names(index)[1]
+        if isinstance(work.target, Remote):
+            work.target.get(folder, [path.name])
+        yield read_arrays(path, records.remedy(folder))
+        if isinstance(work.target, Remote):
+            path.unlink()
