@@ -29,13 +29,14 @@ class Described:
     def __init__(self, data: dataset.Dataset):
         self.collection = collection_of(data)
         kind = getattr(physics, data.collection["scenario"]["name"], None)
-        known = kind.outcomes if isinstance(kind, type) and issubclass(kind, physics.Scenario) else physics.Outcome
+        own = not (isinstance(kind, type) and issubclass(kind, physics.Scenario))  # a scenario of the user
+        known, self.quantities = (physics.Outcome, ()) if own else (kind.outcomes, kind.quantities)
         names = {int(outcome): outcome.name.lower().replace("_", " ") for outcome in known}
         numbers = data.trajectory["outcome"].tolist()
         if not set(numbers) <= set(names):
             names |= {number: f"outcome {number}" for number in sorted(set(numbers) - set(names))}
         self.outcomes = [names[number] for number in numbers]
-        self.outcome_names = [name for name in names.values() if kind is not None or name in self.outcomes]
+        self.outcome_names = [name for name in names.values() if not own or name in self.outcomes]
         labels = dataset.class_names(self.collection)
         self.classes = [labels[body] for body in data.trajectory["body"].tolist()]
         self.class_names = list(dict.fromkeys(labels))
@@ -105,8 +106,8 @@ def page(
         "<h2>Counts</h2>",
         f'<div class="columns"><div>{_counts(data)}</div><div>{_by_part(described, "outcome")}</div></div>',
         f"<h2>Classes</h2>{_by_part(described, 'class')}",
-        f"<h2>Ranges</h2>{_ranges(data)}",
-        f'<h2>Distributions</h2><div class="charts">{_charts(data)}</div>',
+        f"<h2>Ranges</h2>{_ranges(data, described)}",
+        f'<h2>Distributions</h2><div class="charts">{_charts(data, described)}</div>',
         f"<h2>Places on the pad</h2>{_places(data, described)}",
         "<h2>Contact sheets</h2>",
         *_sheets(data, described, num),
@@ -176,21 +177,21 @@ def _by_part(described: Described, what: str) -> str:
     return _table((what, *described.part_names, "all"), rows)
 
 
-def _numbers(data: dataset.Dataset) -> dict[str, np.ndarray]:
-    return dataset.quantities(data.trajectory, data.hidden, data.solid)
+def _numbers(data: dataset.Dataset, described: Described) -> dict[str, np.ndarray]:
+    return dataset.quantities(data.trajectory, data.hidden, data.solid, described.quantities)
 
 
-def _ranges(data: dataset.Dataset) -> str:
+def _ranges(data: dataset.Dataset, described: Described) -> str:
     rows = []
-    for name, values in _numbers(data).items():
+    for name, values in _numbers(data, described).items():
         points = np.percentile(values, (0, 5, 50, 95, 100))
         rows.append((html.escape(name), *(f"{value:.4g}" for value in (*points, values.mean()))))
     return _table(("per trajectory", "least", "5 %", "median", "95 %", "largest", "mean"), rows)
 
 
-def _charts(data: dataset.Dataset) -> str:
+def _charts(data: dataset.Dataset, described: Described) -> str:
     shown = ("largest force (N)", "force in the last frame (N)", "time until rest (s)", "mass (kg)")
-    numbers = _numbers(data)
+    numbers = _numbers(data, described)
     return "".join(_histogram(name, numbers[name]) for name in shown)
 
 

@@ -2,13 +2,14 @@
 
 import dataclasses
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import PurePath
 from typing import Any
 
 import numpy as np
 
 from sts_jax.dataset.collection import PARTS, Collection, class_names
+from sts_jax.physics import Quantity
 from sts_jax.physics.roll import SLOW_SPEED, SLOW_TURN
 from sts_jax.sensor import Sensor
 
@@ -24,7 +25,10 @@ _SIZES = {
 
 
 def quantities(
-    trajectory: Mapping[str, np.ndarray], hidden: Mapping[str, np.ndarray], solid: Mapping[str, np.ndarray]
+    trajectory: Mapping[str, np.ndarray],
+    hidden: Mapping[str, np.ndarray],
+    solid: Mapping[str, np.ndarray],
+    conditions: Sequence[Quantity] = (),
 ) -> dict[str, np.ndarray]:
     """Numbers that describe each of n trajectories, float `(n,)` by their names and units.
 
@@ -32,11 +36,13 @@ def quantities(
         trajectory: Fields of `physics.Trajectory` by name, each `(n, ...)`, such as `Dataset.trajectory`.
         hidden: Fields of `physics.Hidden` by name, each `(n, ...)`.
         solid: `mass`, `(n,)`.
+        conditions: `Scenario.quantities`, to include the numbers of the condition.
     """
     speed, turn = (np.linalg.norm(trajectory["velocity"][..., part], axis=-1) for part in (slice(3), slice(3, 6)))
     moving, time = (speed > SLOW_SPEED) | (turn > SLOW_TURN), trajectory["time"]
     rest = np.minimum(np.where(moving, np.arange(1, time.shape[1] + 1), 0).max(1), time.shape[1] - 1)
     force = np.linalg.norm(trajectory["wrench"][..., :3], axis=-1)
+    names = [f"{q.name}{axis} ({q.unit})" for q in conditions for axis in ((" x", " y") if q.vector else ("",))]
     return {
         "mass (kg)": solid["mass"],
         "fill": hidden["fill"],
@@ -46,6 +52,7 @@ def quantities(
         "force in the last frame (N)": force[:, -1],
         "time until rest (s)": np.take_along_axis(time, rest[:, None], 1)[:, 0],
         "number of touches": trajectory["touches"],
+        **dict(zip(names, trajectory["condition"].T, strict=False)),
     }
 
 
@@ -170,11 +177,7 @@ class _Figures:
     def __init__(self, collection: Collection, split: Mapping[str, np.ndarray]):
         self._names = np.array(class_names(collection))
         self._outcomes = {int(o): collection.scenario.named(int(o)) for o in collection.scenario.outcomes}
-        self._conditions = [
-            f"{q.name}{axis} ({q.unit})"
-            for q in collection.scenario.quantities
-            for axis in ((" x", " y") if q.vector else ("",))
-        ]
+        self._conditions = collection.scenario.quantities
         self._part = np.empty(collection.num_objects, object)
         for part in PARTS:
             self._part[split[part]] = part
@@ -204,8 +207,7 @@ class _Figures:
         self.settled += int(trajectory["settled"].sum())
         self.resampled += int(trajectory["resampled"].sum())
         self.left_out += len(table["left_out"])
-        numbers = quantities(trajectory, groups["hidden"], groups["solid"])
-        numbers |= dict(zip(self._conditions, trajectory["condition"].T, strict=True))
+        numbers = quantities(trajectory, groups["hidden"], groups["solid"], self._conditions)
         for name, values in numbers.items():
             low, sum_, high = self._ranges.get(name, (np.inf, 0.0, -np.inf))
             values = values.astype(np.float64)
