@@ -3,6 +3,7 @@
 import concurrent.futures
 import dataclasses
 import functools
+import importlib.metadata
 import os
 import tempfile
 import threading
@@ -12,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-import sts_jax
 from sts_jax._checked import in_32_bits
 from sts_jax.dataset import cluster, records
 from sts_jax.dataset.card import CARD, card
@@ -348,7 +348,7 @@ def _write_card(work: _Work, folder: Path) -> None:
     if CARD in (work.target.names() if isinstance(work.target, Remote) else os.listdir(folder)):
         return
     split, tables = split_objects(work.collection), _tables(work, folder)
-    text = card(work.collection, work.sensor, split, tables, version=sts_jax.__version__)
+    text = card(work.collection, work.sensor, split, tables, version=importlib.metadata.version("sts_jax"))
     write_bytes(folder / CARD, text.encode())
     if isinstance(work.target, Remote):
         work.target.put(folder, [CARD])
