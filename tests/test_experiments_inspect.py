@@ -13,7 +13,9 @@ import pytest
 from made_up_dataset import COLLECTION, FRAMES, Faults, write
 from PIL import Image
 
+import sts_jax as sts
 from experiments import inspect
+from experiments.shared import inspecting
 from sts_jax import dataset, hardware
 
 FAULTS = Faults(visual={(2, 3): 0}, tactile={(9, FRAMES - 1): 255})
@@ -179,3 +181,15 @@ def test_without_rerun_the_error_names_the_extra(made, tmp_path, monkeypatch):
     with pytest.raises(ImportError, match=r"pip install 'sts_jax\[view\]'"):
         inspect.main(inspect.Config(str(made[0]), tmp_path / "page.html", rrd=Path("one.rrd")))
     assert not (tmp_path / "page.html").exists()  # the error comes before the work
+
+
+def test_outcomes_of_a_scenario_of_the_user_have_numbers(made):
+    data = dataset.load(made[0])
+    data.collection["scenario"]["name"] = "Mine"
+    data.trajectory["outcome"][:] = [sts.physics.Outcome.STANDS] * 19 + [100]
+    text = inspecting.page(data, "mine", [], num=1, trajectory=None, notes=["A note."])
+    rows = Page(text).rows
+    assert rows["stands"][-1] == "19 95.0%"
+    assert rows["outcome 100"][-1] == "1 5.0%"
+    assert "topples" not in rows
+    assert "A note." in text

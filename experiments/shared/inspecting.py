@@ -1,6 +1,7 @@
 """The page of `experiments.inspect`: counts, ranges, contact sheets, a film and suspicious frames of a dataset."""
 
 import base64
+import enum
 import html
 import io
 import json
@@ -29,14 +30,16 @@ class Described:
     def __init__(self, data: dataset.Dataset):
         self.collection = collection_of(data)
         kind = getattr(physics, data.collection["scenario"]["name"], None)
-        own = not (isinstance(kind, type) and issubclass(kind, physics.Scenario))  # a scenario of the user
-        known, self.quantities = (physics.Outcome, ()) if own else (kind.outcomes, kind.quantities)
+        known: Iterable[enum.IntEnum] = physics.Outcome
+        self.quantities: tuple[physics.Quantity, ...] = ()
+        if is_ours := isinstance(kind, type) and issubclass(kind, physics.Scenario):  # and not a scenario of the user
+            known, self.quantities = kind.outcomes, kind.quantities
         names = {int(outcome): outcome.name.lower().replace("_", " ") for outcome in known}
         numbers = data.trajectory["outcome"].tolist()
         if not set(numbers) <= set(names):
             names |= {number: f"outcome {number}" for number in sorted(set(numbers) - set(names))}
         self.outcomes = [names[number] for number in numbers]
-        self.outcome_names = [name for name in names.values() if not own or name in self.outcomes]
+        self.outcome_names = [name for name in names.values() if is_ours or name in self.outcomes]
         labels = dataset.class_names(self.collection)
         self.classes = [labels[body] for body in data.trajectory["body"].tolist()]
         self.class_names = list(dict.fromkeys(labels))

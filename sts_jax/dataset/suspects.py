@@ -65,7 +65,7 @@ def find_suspects(
         trajectory, frame = data.frames[some].T
         force = np.linalg.norm(data.trajectory["wrench"][trajectory, frame, :3], axis=-1)
         touched = data.trajectory["contact"][trajectory, frame] & (force >= FELT)
-        seen = images.segmentation.any((1, 2))
+        seen = np.asarray(images.segmentation.any((1, 2)))
         blank = np.zeros(len(some), bool)
         if untouched is not None:
             difference = np.maximum(images.tactile, untouched) - np.minimum(images.tactile, untouched)
@@ -125,4 +125,7 @@ def _duplicates(data: Dataset, hashes: dict[str, dict[bytes, list[int]]]) -> lis
                 far = np.linalg.norm(position[trajectory, frame] - position[source, at]) > MOVED
                 if trajectory != source or far:
                     reasons.setdefault(row, []).append(f"{stream} image of trajectory {source}, frame {at}")
-    return [Suspect("duplicate", *data.frames[row].tolist(), row, ", ".join(why)) for row, why in reasons.items()]
+    return [
+        Suspect("duplicate", int(data.frames[row, 0]), int(data.frames[row, 1]), row, ", ".join(why))
+        for row, why in reasons.items()
+    ]
