@@ -13,11 +13,11 @@ ROOMS = [
     for name, paths, lines, budget in re.findall(r"^\| ([^|`]+) \| (`[^|]+) \| ([\d,]+) \| ([\d,]+) \|$", PAGE, re.M)
 ]
 TOTALS = {
-    "library without hardware": 25_550,
+    "library without hardware": 25_750,
     "hardware": 5_080,
-    "experiments": 6_300,
-    "benchmarks": 5_600,
-    "tests": 23_900,
+    "experiments": 6_800,
+    "benchmarks": 5_800,
+    "tests": 24_300,
 }
 
 
