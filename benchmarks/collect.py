@@ -177,7 +177,7 @@ def main(args: Args) -> str:
     lines = [
         "# Collecting, reading and training",
         "",
-        f"`python -m benchmarks.collect --preset {args.preset}`, {platform.machine()}, {cores} CPU cores, JAX on "
+        f"Preset `{args.preset}`, {platform.machine()}, {cores} CPU cores, JAX on "
         f"{jax.default_backend()}.",
         "",
         "| scenario | stage | trajectories/s | frames/s | peak memory (MB) |",
