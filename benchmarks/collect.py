@@ -177,8 +177,7 @@ def main(args: Args) -> str:
     lines = [
         "# Collecting, reading and training",
         "",
-        f"Preset `{args.preset}`, {platform.machine()}, {cores} CPU cores, JAX on "
-        f"{jax.default_backend()}.",
+        f"Preset `{args.preset}`, {platform.machine()}, {cores} CPU cores, JAX on {jax.default_backend()}.",
         "",
         "| scenario | stage | trajectories/s | frames/s | peak memory (MB) |",
         "|---|---|---|---|---|",
