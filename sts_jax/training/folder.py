@@ -156,15 +156,20 @@ def verified(folder: Path) -> int | None:
 def save(folder: Path, state: TrainState, *, compact: bool = False) -> None:
     """Write a checkpoint, then delete older checkpoints. If it fails, the previous checkpoint stays the current one.
 
+    With several processes, all call this function with arrays of which each process has a copy. The first one writes.
+
     Args:
         compact: True writes one small file, in which a weight w is a 16-bit integer q, with `w = q s`. Each output
             channel of a kernel has its own step `s = max(rms / 128, largest / 32767)`. Vectors are unchanged.
     """
+    step = int(state.step)
+    path = folder / _place(step)
+    if jax.process_index() > 0:
+        return _write_orbax(path, state)
     before = manifest(folder)
     if before is None:
         before = storage.write_manifest(folder, {}, {"step": None})
-    step, kept = int(state.step), before.facts["step"]
-    path = folder / _place(step)
+    kept = before.facts["step"]
     try:
         _keep_only(folder, kept)  # deletes a checkpoint that an interrupted call may have left
         try:
@@ -173,9 +178,7 @@ def save(folder: Path, state: TrainState, *, compact: bool = False) -> None:
                 write_rounded(path / COMPACT, _plain(state))
             else:
                 path.parent.mkdir(parents=True, exist_ok=True)
-                with _orbax(path) as place:
-                    parts = {part: leaves for part, leaves in _parts(state).items() if leaves}
-                    ocp.save_checkpointables(place, parts)
+                _write_orbax(path, state)
         except Exception as error:  # Orbax and TensorStore raise many types, with pages of traceback
             raise OSError(
                 f"cannot write {path}: {_first_line(error)}. {storage.remedy(error)}, then start again from step "
@@ -197,7 +200,7 @@ def save(folder: Path, state: TrainState, *, compact: bool = False) -> None:
 def save_best(folder: Path, state: TrainState) -> None:
     """Write the weights to the model folder `best` in the folder of a model, with its settings, blank and split."""
     best, listed = folder / BEST, manifest(folder)
-    for name in (CONFIG, BLANK):
+    for name in (CONFIG, BLANK) if jax.process_index() == 0 else ():
         content = (folder / name).read_bytes() if (folder / name).exists() else None
         if content is not None and not (best / name).exists():
             storage.write_bytes(best / name, content)
@@ -205,7 +208,7 @@ def save_best(folder: Path, state: TrainState) -> None:
             raise ValueError(f"{best / name} is that of another training than {folder / name}: delete {best}")
     if verified(best) == int(state.step):
         return  # written before a kill
-    if manifest(best) is None:
+    if jax.process_index() == 0 and manifest(best) is None:
         facts = {} if listed is None else {name: fact for name, fact in listed.facts.items() if name == "split"}
         storage.write_manifest(best, {}, {**facts, "step": None})
     save(best, state._replace(optimiser=None))
@@ -485,22 +488,26 @@ def read_rounded(path: Path) -> dict[str, np.ndarray]:
     return arrays
 
 
+def _write_orbax(path: Path, state: TrainState) -> None:
+    with _orbax(path) as place:
+        ocp.save_checkpointables(place, {part: leaves for part, leaves in _parts(state).items() if leaves})
+
+
 def _read_orbax(path: Path, part: str, wanted: dict[str, Any]) -> dict[str, Array]:
     if not wanted and not (path / part).exists():
         return {}  # an optimiser without arrays has no part of its own
-    device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    device = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
     abstract = {name: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device) for name, x in wanted.items()}
-    context = ocp.Context()
+    context = _alone()
     context.pytree.loading.partial_load = True
-    with _orbax(path) as place:
+    with _orbax(path) as place, context:
         # Compare the shapes first. Orbax cuts or pads arrays of another shape, or prints thousands of lines.
         stored = ocp.metadata(place, part).metadata
         _compare(stored, wanted)
         if part == OPTIMISER and stored.keys() != wanted.keys():
             extra = min(stored.keys() - wanted.keys())
             raise ValueError(f"the checkpoint has the array {extra}, which the given optimiser's state lacks")
-        with context:
-            return ocp.load(place, abstract, checkpointable_name=part)
+        return ocp.load(place, abstract, checkpointable_name=part)
 
 
 def _compare(stored: Mapping[str, Any], wanted: dict[str, Any]) -> None:
@@ -543,6 +550,16 @@ def _orbax(path: Path) -> Iterator[str]:
             link.symlink_to(path.parent)
             path = link / path.name
         yield str(path)
+
+
+def _alone() -> ocp.Context:
+    """Options of Orbax, with which it reads without waiting for other processes."""
+    context = ocp.Context()
+    if jax.process_count() > 1:
+        context.multiprocessing.primary_host = jax.process_index()
+        context.multiprocessing.active_processes = {jax.process_index()}
+        context.multiprocessing.barrier_sync_key_prefix = f"process {jax.process_index()}"
+    return context
 
 
 def _plain(state: TrainState) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import concurrent.futures
 import functools
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -26,6 +26,7 @@ from sts_jax._ranges import COUNT, NOT_NEGATIVE, NUMBER, POSITIVE, SHARE
 from sts_jax._ranges import check as check_ranges
 from sts_jax.training import folder
 from sts_jax.training.arrays import Arrays, Batch, Config, check, order
+from sts_jax.training.devices import Devices
 from sts_jax.training.folder import KINDS, Model, Record, TrainState, load
 from sts_jax.training.preprocess import Preprocessing
 
@@ -220,6 +221,7 @@ def train(
     loss: Loss | None = None,
     optimiser: optax.GradientTransformation | None = None,
     notes: dict[str, Any] | None = None,
+    devices: Sequence[jax.Device] | None = None,
     progress: Progress | None = None,
     log: Log | None = None,
 ) -> Model:
@@ -244,6 +246,8 @@ def train(
         optimiser: Replaces the optimiser from `training.optimiser` and its fields of `config`.
         notes: JSON values that name the given loss and optimiser, stored in `config.json`. A resumed training must have
             the same notes, because the functions themselves cannot be compared.
+        devices: Devices over which each batch is split. None: all devices, of all processes of `jax.distributed`. Then
+            every process calls `train` with the same arguments. The first one writes the folder, and all read it.
         progress: Function that is called after every step with the number of steps done, the number of all steps,
             and the latest record of `metrics.jsonl` (empty before the first record).
         log: Function that is called once for each record, with the step and the values of the record. A resumed
@@ -254,6 +258,8 @@ def train(
     """
     workdir = Path(workdir)
     total = config.total(len(arrays))
+    further = {name: getattr(config, name) for name in ("views", "falls") if getattr(arrays, name)}
+    over = Devices.of(devices, batch_size=config.batch_size, **further)
     task = learner(model, targets=targets, absent=absent)
     task.check(arrays)
     if loss is not None:
@@ -278,20 +284,26 @@ def train(
     settings = json.loads(json.dumps(settings))
     groups = {"model": model, "training": config, "preprocessing": Preprocessing()}
     defaults = {name: storage.default_fields(group) for name, group in groups.items()}
-    if folder.verified(workdir) == total:  # without a lock, because a lock would write a file
+    step_done = folder.verified(workdir)
+    over.agree(settings=settings, step=step_done)
+    if step_done == total:  # without a lock, because a lock would write a file
         storage.claim(workdir / folder.CONFIG, settings, defaults)
         _send(folder.records(workdir), log)
         return load(workdir, calibrated=False)
-    with storage.lock(workdir):
-        storage.claim(workdir / folder.CONFIG, settings, defaults)
+    with over.lock(workdir):
+        if over.leads:
+            storage.claim(workdir / folder.CONFIG, settings, defaults)
         optimiser = optimiser or _default_optimiser(config, total)
         graphdef, state = initial(config, task, total, optimiser)
-        state = folder.restore(workdir, state) or state
+        state = over.copies(folder.restore(workdir, state) or state)
         take = jax.jit(
-            lambda state, batch: step(task, graphdef, config, total, state, batch, optimiser), donate_argnums=0
+            lambda state, batch: step(task, graphdef, config, total, state, batch, optimiser),
+            donate_argnums=0,
+            out_shardings=over.everywhere,
         )
-        score = None if validation is None else _scorer(config, task, graphdef, validation)
-        state = _run(config, arrays, workdir, state, take, score, progress, log)
+        score = None if validation is None else _scorer(config, task, graphdef, validation, over)
+        state = over.one(_run(config, arrays, workdir, state, over, take, score, progress, log))
+        over.wait("end of the training")
     return Model(model, graphdef, nnx.merge_state(state.params, state.stats), int(state.step), settings)
 
 
@@ -300,6 +312,7 @@ def _run(
     arrays: Arrays,
     workdir: Path,
     state: TrainState,
+    over: Devices,
     take: Callable[[TrainState, Batch], tuple[TrainState, Terms]],
     score: Callable[[TrainState], float] | None,
     progress: Progress | None,
@@ -307,12 +320,12 @@ def _run(
 ) -> TrainState:
     """Make the remaining steps, with a record every `log_every` and a checkpoint every `checkpoint_every` steps."""
     start, total = int(state.step), config.total(len(arrays))
-    kept = folder.resume_log(workdir)
+    kept = folder.resume_log(workdir) if over.leads else folder.records(workdir)
     _send(kept, log)
     record = kept[-1] if kept else {}
     least = min((each["validation"] for each in kept if "validation" in each), default=np.inf)
     recent: list[Terms] = []
-    batches = _batches(config, arrays, start, total)
+    batches = _batches(config, arrays, start, total, over)
     for done in range(start + 1, total + 1):
         state, terms = take(state, next(batches))
         recent.append(jax.block_until_ready(terms))
@@ -322,7 +335,8 @@ def _run(
             if score is not None and at_checkpoint:
                 record["validation"] = score(state)
             recent = []
-            folder.append(workdir, record)
+            if over.leads:
+                folder.append(workdir, record)
             _send([record], log)
             if not np.isfinite(record["loss"]):
                 raise FloatingPointError(
@@ -337,29 +351,31 @@ def _run(
         if at_checkpoint:
             if record.get("validation", np.inf) < least:
                 least = record["validation"]
-                folder.save_best(workdir, state)  # before the checkpoint, so that a resumed training finds it
-            folder.save(workdir, state)
+                folder.save_best(workdir, over.whole(state))  # before the checkpoint: a resumed training finds it
+            folder.save(workdir, over.whole(state))
         if progress is not None:
             progress(done, total, record)
     return state
 
 
-def _batches(config: TrainConfig, arrays: Arrays, start: int, total: int) -> Iterator[Batch]:
+def _batches(config: TrainConfig, arrays: Arrays, start: int, total: int, over: Devices) -> Iterator[Batch]:
     further = {
         name: order(config.seed + 1, len(values["state"]), size, start, total)
         for name, values, size in (("views", arrays.views, config.views), ("falls", arrays.falls, config.falls))
         if values and size
     }
     rows = zip(order(config.seed, len(arrays), config.batch_size, start, total), *further.values(), strict=True)
-    return _read_ahead(arrays, ((first, dict(zip(further, more, strict=True))) for first, *more in rows))
+    return _read_ahead(arrays, ((first, dict(zip(further, more, strict=True))) for first, *more in rows), over)
 
 
-def _read_ahead(arrays: Arrays, chosen: Iterable[tuple[np.ndarray, dict[str, np.ndarray]]]) -> Iterator[Batch]:
+def _read_ahead(
+    arrays: Arrays, chosen: Iterable[tuple[np.ndarray, dict[str, np.ndarray]]], over: Devices
+) -> Iterator[Batch]:
     """Take batches in a thread, while the device computes. `chosen` has the arguments of `Arrays.take`."""
     with concurrent.futures.ThreadPoolExecutor(1) as pool:
         waiting: collections.deque[concurrent.futures.Future[Batch]] = collections.deque()
         for index, further in chosen:
-            waiting.append(pool.submit(arrays.take, index, **further))
+            waiting.append(pool.submit(over.take, arrays, index, further))
             if len(waiting) > _AHEAD:
                 yield waiting.popleft().result()
         while waiting:
@@ -367,7 +383,7 @@ def _read_ahead(arrays: Arrays, chosen: Iterable[tuple[np.ndarray, dict[str, np.
 
 
 def _scorer(
-    config: TrainConfig, task: Learner, graphdef: nnx.GraphDef[Any], validation: Arrays
+    config: TrainConfig, task: Learner, graphdef: nnx.GraphDef[Any], validation: Arrays, over: Devices
 ) -> Callable[[TrainState], float]:
     """A function that computes the validation loss of a state."""
     starts = range(0, len(validation), config.batch_size)
@@ -379,7 +395,7 @@ def _scorer(
 
     def score(state: TrainState) -> float:
         keys = jax.random.split(jax.random.key(config.seed), len(rows))
-        batches = _read_ahead(validation, ((index, {}) for index in rows))
+        batches = _read_ahead(validation, ((index, {}) for index in rows), over)
         values = [float(loss(state.params, state.stats, *both)) for both in zip(keys, batches, strict=True)]
         return float(np.average(values, weights=[len(index) for index in rows]))
 
