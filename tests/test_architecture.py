@@ -13,11 +13,11 @@ ROOMS = [
     for name, paths, lines, budget in re.findall(r"^\| ([^|`]+) \| (`[^|]+) \| ([\d,]+) \| ([\d,]+) \|$", PAGE, re.M)
 ]
 TOTALS = {
-    "library without hardware": 25_750,
+    "library without hardware": 25_980,
     "hardware": 5_080,
     "experiments": 6_800,
     "benchmarks": 5_800,
-    "tests": 24_300,
+    "tests": 24_500,
 }
 
 
