@@ -90,14 +90,19 @@ def assert_same_training(folder, single):
         np.testing.assert_allclose(one, other, atol=2e-6)
     for name in ("metrics.jsonl", "best/metrics.jsonl"):
         assert (folder / name).exists() == (single / name).exists()
+    assert_same_losses(folder, single)
+
+
+def assert_same_losses(folder, single):
     logs = [[*map(json.loads, (path / "metrics.jsonl").read_text().splitlines())] for path in (folder, single)]
     for one, other in zip(*logs, strict=True):
         assert one == pytest.approx(other, rel=1e-5)
 
 
 @pytest.mark.slow
-def test_two_devices_train_as_one(tmp_path, single):
-    codes, errors = run(tmp_path / "run", devices=2)
+@pytest.mark.parametrize("count", [2, 3])  # 3 do not divide the batch of 8, so that 2 are used
+def test_several_devices_train_as_one(tmp_path, single, count):
+    codes, errors = run(tmp_path / "run", devices=count)
     assert codes == [0], errors
     assert_same_training(tmp_path / "run", single)
 
@@ -120,15 +125,17 @@ def test_a_state_space_model_with_views_and_falls_trains_as_on_one_device(tmp_pa
     for name, devices in (("one", 1), ("two", 2)):
         codes, errors = run(tmp_path / name, "state", devices=devices)
         assert codes == [0], errors
-    for one, other in zip(weights(tmp_path / "one"), weights(tmp_path / "two"), strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-4)
+    one, two = (np.concatenate([np.ravel(leaf) for leaf in weights(tmp_path / name)]) for name in ("one", "two"))
+    # Adam makes a step of full length from a gradient that is rounding alone, which a few weights have.
+    assert np.quantile(np.abs(one - two), 0.999) < 2e-6
+    assert_same_losses(tmp_path / "two", tmp_path / "one")
 
 
 @pytest.mark.slow
-def test_a_batch_that_the_devices_do_not_divide_is_named(tmp_path):
-    codes, errors = run(tmp_path / "run", devices=2, batch_size=7)
-    assert codes == [1]
-    assert "batch_size is 7, but it must be a multiple of 2, the number of devices" in errors[0]
+def test_a_batch_that_the_processes_do_not_divide_is_named(tmp_path):
+    codes, errors = run(tmp_path / "run", count=2, batch_size=7)
+    assert codes == [1, 1]
+    assert all("batch_size is 7, but it must be a multiple of 2, the number of devices" in error for error in errors)
     assert not (tmp_path / "run").exists()
 
 

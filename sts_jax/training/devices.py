@@ -29,10 +29,17 @@ class Devices(NamedTuple):
         """Check that the devices divide the sizes of a batch, and that each process has as many of them.
 
         Args:
-            devices: None for all devices of all processes.
+            devices: None for as many devices of each process as divide the sizes: all, or fewer.
             sizes: Numbers of items of a batch by the name of their field in `TrainConfig`.
         """
         chosen = sorted(jax.devices() if devices is None else devices, key=lambda one: (one.process_index, one.id))
+        if devices is None:
+            most = min(sum(one.process_index == process for one in chosen) for process in range(jax.process_count()))
+            each = next(
+                (n for n in range(most, 1, -1) if not any(s % (n * jax.process_count()) for s in sizes.values())), 1
+            )
+            places = [[one for one in chosen if one.process_index == i][:each] for i in range(jax.process_count())]
+            chosen = [one for place in places for one in place]
         counts = [sum(one.process_index == process for one in chosen) for process in range(jax.process_count())]
         if not chosen or len(set(counts)) > 1:
             raise ValueError(f"devices must be as many in each process, and at least 1, got {counts} in the processes")
