@@ -201,9 +201,9 @@ def test_lerobot_has_the_layout_of_version_3(native, tmp_path, frames):
         assert kind == (value if shape == (1,) else pa.list_(value, shape[0]))
         assert feature["names"] is None or len(feature["names"]) == shape[0]
 
-    tasks = pq.read_table(out / "meta/tasks.parquet").to_pandas()
-    assert tasks.index.tolist() == ["perturbed"]
-    assert tasks.iloc[0].to_dict() == {"task_index": 0}
+    tasks = pq.read_table(out / "meta/tasks.parquet")
+    (index,) = json.loads(tasks.schema.metadata[b"pandas"])["index_columns"]  # pandas reads the task as the index
+    assert tasks.to_pylist() == [{"task_index": 0, index: "perturbed"}]
 
     (path,) = (out / "meta/episodes").glob("*/*.parquet")
     assert path.parts[-2:] == ("chunk-000", "file-000.parquet")
