@@ -84,7 +84,11 @@ def main(config: Config) -> None:
         )
     with terminal.Bar() as bar:
         suspects = dataset.find_suspects(
-            data, skin, rows=rows, progress=lambda done: bar("examine frames", done, len(rows))
+            data,
+            inspecting.sensor_of(data),
+            skin,
+            rows=rows,
+            progress=lambda done: bar("examine frames", done, len(rows)),
         )
     for one in suspects[:PRINTED]:
         print(inspecting.named(one))

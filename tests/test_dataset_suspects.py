@@ -18,7 +18,7 @@ UNSEEN = Faults(hidden=((6, LAST), (6, 0)))
 def found(folder, faults, **options):
     write(folder, faults)
     data = dataset.load(folder)
-    return data, dataset.find_suspects(data, dataset.find_untouched(data), **options)
+    return data, dataset.find_suspects(data, sts.Sensor(), dataset.find_untouched(data), **options)
 
 
 def test_a_clean_dataset_has_no_suspects(tmp_path):
@@ -52,7 +52,7 @@ def test_only_the_asked_frames_are_examined(tmp_path):
     assert suspects == []
     assert seen[-1] == 3
     (row,) = np.flatnonzero((data.frames == (2, 3)).all(1))
-    assert [one.row for one in dataset.find_suspects(data, None, rows=np.array([row]))] == [row]
+    assert [one.row for one in dataset.find_suspects(data, sts.Sensor(), None, rows=np.array([row]))] == [row]
 
 
 def test_an_image_at_rest_may_repeat(tmp_path):
@@ -60,7 +60,16 @@ def test_an_image_at_rest_may_repeat(tmp_path):
     write(tmp_path, COPIES)
     data = dataset.load(tmp_path)
     data.trajectory["pose"][2, 4, :3] = data.trajectory["pose"][2, 2, :3]
-    assert [(one.trajectory, one.frame) for one in dataset.find_suspects(data, None)] == [(15, 0)]
+    assert [(one.trajectory, one.frame) for one in dataset.find_suspects(data, sts.Sensor(), None)] == [(15, 0)]
+
+
+@pytest.mark.parametrize(("centre", "count"), [(0.074, 0), (0.069, 1)])
+def test_an_object_that_hangs_over_the_edge_may_leave_no_imprint(tmp_path, centre, count):
+    """The pad is 150 mm wide, so its edge is 75 mm from its centre."""
+    write(tmp_path, BLANK)
+    data = dataset.load(tmp_path)
+    data.trajectory["wrench"][1, 2, 3] = centre * data.trajectory["wrench"][1, 2, 2]  # Mx = y Fz
+    assert len(dataset.find_suspects(data, sts.Sensor(), dataset.find_untouched(data))) == count
 
 
 @pytest.mark.slow
@@ -72,4 +81,5 @@ def test_a_simulated_dataset_has_no_suspects(tmp_path, scenario):
     collection = dataset.Collection(scenario, classes, num_objects=4, num_per_object=2, num_full=2, objects_per_shard=4)
     dataset.collect(collection, sts.Sensor(), tmp_path)
     data = dataset.load(tmp_path)
-    assert dataset.find_suspects(data, dataset.empty_frame(sts.Sensor(), collection).tactile) == []
+    sensor = sts.Sensor()
+    assert dataset.find_suspects(data, sensor, dataset.empty_frame(sensor, collection).tactile) == []

@@ -230,7 +230,7 @@ def served(tmp_path):
 
 
 def post(server, path):
-    with urllib.request.urlopen(urllib.request.Request(server.url + path, method="POST"), timeout=30) as answer:
+    with urllib.request.urlopen(urllib.request.Request(server.url + path, method="POST"), timeout=300) as answer:
         return json.load(answer)
 
 

@@ -8,11 +8,13 @@ import numpy as np
 
 from sts_jax.dataset.loading import Dataset
 from sts_jax.dataset.records import Images
+from sts_jax.sensor import Sensor
 
 DARK = 16  # brightest value of a black image, of 255
 CLIPPED = 0.1  # least share of the pixels of a clipped image that have the value 255 in some channel
 UNCHANGED = 2  # largest difference of a blank touch from the untouched skin, of 255
 FELT = 0.05  # N, least force that must leave an imprint
+EDGE = 0.005  # m, an object that leans on this border of the pad's face hangs over the pad's edge and may leave none
 MOVED = 0.005  # m, identical images of a trajectory are suspicious if the object has moved farther
 MOST = 64  # frames without contact that are compared
 BATCH = 2**26  # bytes of images that are in memory at a time
@@ -20,7 +22,7 @@ BATCH = 2**26  # bytes of images that are in memory at a time
 KINDS = {
     "black": f"no pixel of an image is brighter than {DARK} of 255",
     "clipped": f"more than {CLIPPED:.0%} of an image's pixels are saturated (255)",
-    "blank touch": f"the pad pushes with at least {FELT:g} N, but the tactile image shows the untouched skin",
+    "blank touch": f"the pad pushes up with at least {FELT:g} N, but the tactile image shows the untouched skin",
     "unseen": "the object touches the pad, but the visual image does not show it",
     "duplicate": "an image is identical to one of another trajectory, or of another place of the object",
 }
@@ -38,6 +40,7 @@ class Suspect(NamedTuple):
 
 def find_suspects(
     data: Dataset,
+    sensor: Sensor,
     untouched: np.ndarray | None,
     *,
     rows: np.ndarray | None = None,
@@ -46,6 +49,7 @@ def find_suspects(
     """Find frames that look faulty, see `KINDS`. All images are read once.
 
     Args:
+        sensor: Sensor of the dataset, whose `gel.size` is the size of the pad.
         untouched: Tactile image of the untouched pad, uint8 `(height, width, 3)`, such as from `find_untouched` or
             `empty_frame`. None: blank touches are not searched.
         rows: Indices into `data.frames` of the frames to examine, int `(n,)`. None: all.
@@ -63,8 +67,13 @@ def find_suspects(
         some = rows[start : start + size]
         images = data.images(some, opened=opened)
         trajectory, frame = data.frames[some].T
-        force = np.linalg.norm(data.trajectory["wrench"][trajectory, frame, :3], axis=-1)
-        touched = data.trajectory["contact"][trajectory, frame] & (force >= FELT)
+        wrench, contact = (data.trajectory[name][trajectory, frame] for name in ("wrench", "contact"))
+        force = np.linalg.norm(wrench[:, :3], axis=-1)
+        touched = contact & (force >= FELT)
+        pressed = contact & (wrench[:, 2] >= FELT)
+        # The centre of pressure is (-My, Mx) / Fz.
+        inside = np.array(sensor.gel.size) / 2 - EDGE
+        pressed &= (np.abs(wrench[:, [4, 3]]) <= inside * wrench[:, 2:3]).all(1)
         seen = np.asarray(images.segmentation.any((1, 2)))
         blank = np.zeros(len(some), bool)
         if untouched is not None:
@@ -72,8 +81,8 @@ def find_suspects(
             blank = difference.max((1, 2, 3)) <= UNCHANGED
         for i, row in enumerate(some.tolist()):
             reasons = _of_frame(images, i)
-            if touched[i] and blank[i]:
-                reasons.append(("blank touch", f"no imprint at {force[i]:.2f} N"))
+            if pressed[i] and blank[i]:
+                reasons.append(("blank touch", f"no imprint at {wrench[i, 2]:.2f} N"))
             if touched[i] and not seen[i]:
                 reasons.append(("unseen", f"no pixel shows the object, which presses with {force[i]:.2f} N"))
             found += [Suspect(kind, int(trajectory[i]), int(frame[i]), row, reason) for kind, reason in reasons]
