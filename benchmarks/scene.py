@@ -254,6 +254,8 @@ def measure(args: Args) -> list[Row]:
         for number in args.envs or ENVS[jax.default_backend() != "cpu"]:
             rows.append(Row(size, number, *work.rates(number, args.repeats)))
             print(line(rows[-1]), flush=True)
+        if work.renderer is not None:
+            work.renderer.close()  # a second renderer beside it would draw nothing, with OSMesa
     return rows
 
 

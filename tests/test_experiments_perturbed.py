@@ -176,3 +176,14 @@ def test_the_deterministic_network_is_judged_beside_the_baselines(workdir):
     text = deterministic.main(deterministic.Args(workdir, "perturbed", "smoke", seconds=1.0))
     for name in (deterministic.TITLE, "nearest neighbour", "rests below its start"):
         assert f"| {name} |" in text
+
+
+def test_a_film_without_curves_is_smooth_and_ends_after_the_motion(tmp_path):
+    """A bottle that is jerked moves for less than 1 s of its 1.9 s."""
+    show.main(show.Config("perturbed", num=1, out=tmp_path, size=32, film="webp", curves=False))
+    with Image.open(tmp_path / "perturbed-0.webp") as film:
+        assert film.format == "WEBP"
+        width, height = film.size
+        assert width == 3 * show.SIDE
+        assert height < 1.3 * show.SIDE
+        assert 15 < film.n_frames < 100

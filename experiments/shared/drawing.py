@@ -103,12 +103,20 @@ def draw_strip(path: Path, collection: dataset.Collection, sensor: sts.Sensor, d
     evaluation.figures.strip(path, one["time"], outside, *streams, one["wrench"], title=title)
 
 
-def views(body: sts.objects.Body, pose: np.ndarray, gravity: np.ndarray, sensor: sts.Sensor, wall: float) -> np.ndarray:
-    """Render the object and the pad obliquely from above, (frames, height, width, 3), with final gravity downwards."""
+def views(
+    body: sts.objects.Body,
+    pose: np.ndarray,
+    gravity: np.ndarray,
+    sensor: sts.Sensor,
+    wall: float,
+    side: int = 160,
+) -> np.ndarray:
+    """Render the object and the pad obliquely from above, (frames, side, side, 3), with final gravity downwards."""
     size, up = jnp.array(sensor.gel.size), -jnp.asarray(gravity[-1])
     frozen = np.append(False, (pose[1:] == pose[:-1]).all(1)) & np.asarray(sts.physics.fell_off(jnp.asarray(pose)))
     pose = np.where(frozen[:, None], np.array([0, 0, -10, 1, 0, 0, 0], np.float32), pose)
-    return np.stack([np.asarray(evaluation.outside(body, jnp.asarray(each), size, up, wall)) for each in pose])
+    drawn = (evaluation.outside(body, jnp.asarray(each), size, up, wall, resolution=(side, side)) for each in pose)
+    return np.stack([np.asarray(image) for image in drawn])
 
 
 def describe(

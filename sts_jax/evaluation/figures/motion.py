@@ -143,7 +143,7 @@ def animation(
     view: np.ndarray,
     visual: np.ndarray,
     tactile: np.ndarray,
-    wrench: np.ndarray,
+    wrench: np.ndarray | None,
     gravity: np.ndarray,
     *,
     title: str = "",
@@ -156,14 +156,15 @@ def animation(
     component of `gravity` along the pad. The animation runs at half the speed of the motion (`SLOWER` is 2).
 
     Args:
+        path: File whose suffix is `.gif` (256 colours), or `.webp` (all colours, a fraction of the size).
         time: Times of the frames (s). The other arrays have a row for each frame, and images are in [0, 1].
         view: Images of `outside`.
-        wrench: Wrench (N, N m), `(frames, 6)`.
+        wrench: Wrench (N, N m), `(frames, 6)`. None: no curves.
         gravity: Gravity minus the acceleration of the pad in the sensor frame (m/s^2), `(frames, 3)`.
         outcome: Text above the images in the last frame, such as `fell off`.
         side: Side of each of the three images (pixels).
     """
-    width, height = 3 * side, _HEAD + side + 2 * _PANEL
+    width, height = 3 * side, _HEAD + side + (0 if wrench is None else 2 * _PANEL)
     figure = plt.figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI)
     figure.text(6 / width, 1 - 5 / height, title, va="top", fontsize=8)
     clock = figure.text(6 / width, 1 - 23 / height, "", va="top", fontsize=8.6)
@@ -171,11 +172,13 @@ def animation(
     axes = [_axes(figure, column * side, _HEAD, side, side) for column in range(3)]
     pictures = [_picture(axis, name, images[0]) for axis, (name, images) in zip(axes, streams.items(), strict=True)]
     arrow, label = _gravity(axes[1])
-    force, moment = wrench[:, :3], 1e3 * wrench[:, 3:]
-    curves = [
-        (_panel(figure, 0, "force (N)", "F", time, force), force),
-        (_panel(figure, 1, "moment about the sensor's origin (mN m)", "M", time, moment), moment),
-    ]
+    curves = []
+    if wrench is not None:
+        force, moment = wrench[:, :3], 1e3 * wrench[:, 3:]
+        curves = [
+            (_panel(figure, 0, "force (N)", "F", time, force), force),
+            (_panel(figure, 1, "moment about the sensor's origin (mN m)", "M", time, moment), moment),
+        ]
 
     def draw_page(t: int) -> None:
         last = f": {outcome}" if t == len(time) - 1 else ""
@@ -197,7 +200,7 @@ def animation(
             figure, draw_page, pages, init_func=lambda: None, interval=step + 0.5, cache_frame_data=False
         )
         with tempfile.TemporaryDirectory() as folder:
-            temporary = Path(folder) / "film.gif"
+            temporary = Path(folder) / f"film{path.suffix}"
             film.save(temporary, "pillow", dpi=_DPI)
             write_bytes(path, temporary.read_bytes())
     finally:
