@@ -11,7 +11,7 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 RESULTS = "benchmarks/results/"
-SUFFIXES = (".md", ".png", ".txt")
+SUFFIXES = (".md", ".png", ".txt", ".webp")
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:

@@ -46,6 +46,7 @@ def test_home_has_the_open_gripper_around_an_object_at_rest():
         np.testing.assert_allclose(np.cross(x, y), z, atol=1e-12)
     com = data.body("object").xpos + data.body("object").xmat.reshape(3, 3) @ np.asarray(body.shell_com)
     np.testing.assert_allclose(data.body("object").xipos, com, atol=1e-7)
+    np.testing.assert_allclose(model.qpos0, data.qpos, atol=1e-12)  # new data are open too
     before = data.qpos.copy()
     mujoco.mj_step(model, data, 200)
     np.testing.assert_allclose(data.qpos, before, atol=1e-4)

@@ -56,9 +56,9 @@ _SCENE = """
 </mujoco>
 """
 _FINGER = """
-<body name="{side}" gravcomp="1">
+<body name="{side}" pos="{out} 0 0" gravcomp="1">
   <inertial pos="0 0 0" mass="{mass}" diaginertia="1e-4 1e-4 1e-4"/>
-  <joint name="{side}" type="slide" axis="{sign} 0 0" range="0 {half}" damping="1"/>
+  <joint name="{side}" type="slide" axis="{sign} 0 0" ref="{half}" range="0 {half}" damping="1"/>
   <geom class="shown" name="{side}_finger" pos="{middle} 0 {rise}" size="{deep} {half_width} {long}"/>
   <site name="{side}_tip" quat="{turn}"/>
 </body>
@@ -131,6 +131,7 @@ def gripper(
         _FINGER.format(
             side=side,
             sign=sign,
+            out=sign * opening / 2,
             mass=FINGER_MASS,
             half=opening / 2,
             turn=_row(Rotation.from_matrix(np.transpose(axes)).as_quat(scalar_first=True)),
