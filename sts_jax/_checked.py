@@ -15,12 +15,28 @@ import numpy as np
 from beartype import BeartypeConf, beartype
 from jaxtyping import jaxtyped
 
-# Check array shapes and argument types by the annotations. An int is accepted for a float (PEP 484).
-checked = jaxtyped(typechecker=beartype(conf=BeartypeConf(is_pep484_tower=True)))
-
+_by_annotations = jaxtyped(typechecker=beartype(conf=BeartypeConf(is_pep484_tower=True)))  # an int is also a float
 _INSIDE = (str(Path(__file__).parent), str(Path(jaxtyping.__file__).parent), "<@beartype")  # files of the entry points
 P = ParamSpec("P")
 R = TypeVar("R")
+
+
+def checked(function: Callable[P, R]) -> Callable[P, R]:
+    """Check array shapes and argument types by the annotations, with errors that leave out the other arguments."""
+    inside = _by_annotations(function)
+
+    @functools.wraps(function)
+    def run(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            return inside(*args, **kwargs)
+        except jaxtyping.TypeCheckError as error:
+            what, line, rest = str(error).partition("\n----")
+            if not line:  # of a function inside, whose error is short already
+                raise
+            _, known, axes = rest.partition("\nThe current values for each jaxtyping axis")  # such as b=3
+            raise jaxtyping.TypeCheckError(what + known + axes) from None
+
+    return run
 
 
 def in_32_bits(function: Callable[P, R]) -> Callable[P, R]:
