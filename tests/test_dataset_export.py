@@ -6,6 +6,7 @@ import io
 import json
 import multiprocessing
 import os
+import shutil
 import signal
 import time
 from pathlib import Path
@@ -332,6 +333,13 @@ def test_a_killed_export_leaves_nothing_and_the_next_one_is_complete(native, tmp
     export.FORMATS[name](folder, target)
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
     assert not any(path.name.startswith(".lock") for path in target.iterdir())
+
+
+def test_an_export_has_the_data_card_with_the_licence_of_the_objects(native, tmp_path):
+    shutil.copytree(native[0], tmp_path / "native")
+    (tmp_path / "native" / "README.md").write_text("licence: CC BY 4.0, from elsewhere\n")
+    export.to_png(tmp_path / "native", tmp_path / "out")
+    assert (tmp_path / "out" / "README.md").read_text() == "licence: CC BY 4.0, from elsewhere\n"
 
 
 def test_another_export_or_folder_is_refused_and_the_same_export_is_kept(native, tmp_path):

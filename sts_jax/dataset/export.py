@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 
 from sts_jax import physics
+from sts_jax.dataset.card import CARD
 from sts_jax.dataset.collection import PARTS
 from sts_jax.dataset.items import frame_fields, trajectory_fields
 from sts_jax.dataset.loading import Dataset, load
@@ -170,6 +171,8 @@ def _exported(
                 if path.is_dir():
                     shutil.rmtree(path)
             write(partial, job)
+            if (job.folder / CARD).exists():
+                shutil.copyfile(job.folder / CARD, partial / CARD)
             write_json(partial / RECORD, record)
             os.sync()
             if target.exists():

@@ -10,6 +10,7 @@ from typing import TypeVar
 import fsspec
 
 from sts_jax.compilation import cache_folder
+from sts_jax.dataset.card import CARD
 from sts_jax.storage import MANIFEST, Manifest, digest, read_manifest, remedy
 
 Result = TypeVar("Result")
@@ -99,5 +100,5 @@ def local_copy(remote: Remote) -> Path:
     for name in after.files:
         if before.files.get(name) != after.files[name] or not (folder / name).exists():
             remote.get(folder, [name])
-    remote.get(folder, [MANIFEST])
+    remote.get(folder, [name for name in (CARD, MANIFEST) if name in names])
     return folder
