@@ -29,6 +29,7 @@ from sts_jax.evaluation import figures
 from sts_jax.training import TrainConfig
 
 SHOWN = 24  # held-out trajectories in the largest figures
+DRAWN = 16  # samples of the state-space model for each predicted last frame
 COURSES = 4  # sampled courses of a state-space model whose mean images are drawn
 SHEETS = ("mvae", "statespace")  # models whose predictions and roll-outs are drawn
 CROSSED = ("mvae-without-pose", "statespace")  # models that predict one stream from the other one
@@ -204,13 +205,18 @@ def draw_scene(
         drawn.append(folder / f"{stem}.png")
         return drawn[-1]
 
-    ends = {model: evaluation.predict(p, p.modalities, test, scenario) for model, p in final.items()}
+    drawings = {model: DRAWN if model in cells.STATE else 0 for model in final}
+    ends = {
+        model: evaluation.predict(p, p.modalities, test, scenario, num_samples=drawings[model])
+        for model, p in final.items()
+    }
     bodies = dataset.make_bodies(scene.collection, test.object)
+    camera = None if scene.collection.crop else sensor.camera
     some = every[: SHOWN // 3]
     for model in (model for model in SHEETS if model in ends):
         for stem, items in ((model, some), (f"{model}-large", every)):
             outlines, title = [bodies[i] for i in items], f"{scene.name}: {NAMES[model]}, the last frame from the first"
-            more = {**look, "size": (width, height), "title": title, "bodies": outlines}
+            more = {**look, "size": (width, height), "title": title, "bodies": outlines, "camera": camera}
             figures.pose_sheet(path(f"predictions-{stem}"), test, ends[model], items, **more)
     papers = {NAMES[model]: ends[model] for model in cells.PAPER if model in ends}
     if papers:
@@ -218,7 +224,10 @@ def draw_scene(
         figures.models_sheet(path("models"), test, papers, some, **look, title=title)
     for model, predictor in final.items():
         if model in CROSSED and {"visual", "tactile"} <= set(predictor.modalities):
-            touch, vision = (evaluation.predict(predictor, (name,), test, scenario) for name in ("tactile", "visual"))
+            touch, vision = (
+                evaluation.predict(predictor, (name,), test, scenario, num_samples=drawings[model])
+                for name in ("tactile", "visual")
+            )
             title = f"{scene.name}: {NAMES[model]}, each stream from the other one"
             figures.crossed_sheet(path(f"crossed-{model}"), test, touch, vision, some, **look, title=title)
     time, curves = scene.data.trajectory["time"][test.trajectory[0]], dict[str, evaluation.Curve]()

@@ -1,7 +1,9 @@
 """`show` draws a figure of a result, `save` writes a result to a file, and `load` reads it."""
 
 import io
+import math
 import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,7 +14,10 @@ from jaxtyping import ArrayLike
 from matplotlib.figure import Figure
 from PIL import Image
 
+from sts_jax import optics
 from sts_jax._checked import check_arrays
+from sts_jax.evaluation import STREAMS
+from sts_jax.evaluation.figures import SAMPLES, draw_outlines
 from sts_jax.evaluation.figures.motion import outside
 from sts_jax.frame import Frame
 from sts_jax.objects import Body
@@ -21,10 +26,13 @@ from sts_jax.prediction import Prediction
 from sts_jax.sensor import Sensor
 from sts_jax.storage import DamagedFileError, write_bytes
 
+_Place = tuple[str, np.ndarray | None]  # name of an image, and the image
 _KINDS: dict[str, type] = {kind.__name__: kind for kind in (Frame, Body, Trajectory)}
 _INCH = 2.6  # height of a panel (inches)
+_MOST = 4  # largest number of panels side by side
 _STRIP = 12.0  # largest width of a strip of frames (inches)
 _WIDE = 2.5  # least width of a strip in multiples of its height
+_CELL, _SMALL = 1.7, 0.5  # side of an image of a prediction (inches), and that of a mean beside samples as its share
 _FORMAT = 1  # version of the layout of .npz files
 
 
@@ -37,8 +45,20 @@ class NotebookFigure(Figure):
         return data.getvalue()
 
 
-def show(thing: Frame | Body | Prediction | ArrayLike, *, title: str = "") -> Figure:
+def show(
+    thing: Frame | Body | Prediction | ArrayLike,
+    *,
+    title: str = "",
+    given: Frame | Mapping[str, ArrayLike] | None = None,
+    truth: Frame | Mapping[str, ArrayLike] | None = None,
+    body: Body | None = None,
+    sensor: Sensor | None = None,
+) -> Figure:
     """Draw a frame, a body, a prediction or an image. A notebook displays the figure; elsewhere call `figure.savefig`.
+
+    A prediction has one row for each stream: the input, the truth, up to four samples, and the mean. A mean over
+    uncertain ends is blurred, and each sample is one possible end: predict with `num_samples` to see them. A roll-out
+    has one strip of its steps for each of these images.
 
     Args:
         thing: One item. A `Frame` gives its visual and tactile image, depth (mm) and pressure (kPa), a `Body` an
@@ -46,13 +66,32 @@ def show(thing: Frame | Body | Prediction | ArrayLike, *, title: str = "") -> Fi
             uint8 is an image. Images (n, height, width, 3), and the steps of a roll-out, are drawn side by side. Select
             item i of a batch with `jax.tree.map(lambda x: x[i], frames)`.
         title: Title of the figure. By default, the description of a `Body`, and no title otherwise.
+        given: First frame, from which a `Prediction` was made: a `Frame`, or a mapping with the image `visual`,
+            `tactile` or both. None draws no input.
+        truth: True last frame, like `given`. For a roll-out, frames (steps, height, width, 3).
+        body: Object whose outlines at up to 16 predicted poses are drawn over the visual image of `given`. For a
+            roll-out, those of the last step.
+        sensor: Sensor of `given`, whose camera sees the outlines. None: `Sensor()`.
     """
-    panels = _panels(thing)
-    if isinstance(thing, Body):
-        title = title or repr(thing)
+    if isinstance(thing, Prediction):
+        figure = _prediction(thing, given, truth, body, sensor or Sensor())
+    else:
+        if named := [name for name, x in (("given", given), ("truth", truth), ("body", body)) if x is not None]:
+            raise ValueError(f"{named[0]} is drawn beside a Prediction, but `thing` is a {type(thing).__name__}")
+        figure = _row(_panels(thing))
+        if isinstance(thing, Body):
+            title = title or repr(thing)
+    if title:
+        figure.suptitle(title, fontsize=9)
+    return figure
+
+
+def _row(panels: Sequence["_Panel"]) -> Figure:
+    """A figure with panels side by side. Strips are stacked."""
     height = _INCH if len(panels) > 1 else 1.5 * _INCH
     rows, columns, size = 1, len(panels), (1.15 * height * len(panels), height + 0.4)
-    if (aspect := panels[0].values.shape[1] / panels[0].values.shape[0]) > _WIDE:  # strips are stacked
+    aspect = max(panel.values.shape[1] / panel.values.shape[0] for panel in panels)
+    if stacked := aspect > _WIDE or len(panels) > _MOST:
         width = min(_STRIP, _INCH * aspect)
         rows, columns, size = len(panels), 1, (width, (width / aspect + 0.3) * len(panels) + 0.4)
     figure = NotebookFigure(figsize=size, layout="constrained")
@@ -62,8 +101,7 @@ def show(thing: Frame | Body | Prediction | ArrayLike, *, title: str = "") -> Fi
             figure.colorbar(drawn, ax=axes, shrink=0.8)
         axes.set_title(panel.name, fontsize=9)
         axes.set_axis_off()
-    if title:
-        figure.suptitle(title, fontsize=9)
+        axes.set_anchor("W" if stacked else "C")
     return figure
 
 
@@ -92,15 +130,86 @@ def _panels(thing: Frame | Body | Prediction | ArrayLike) -> list[_Panel]:
         middle = (low + high) / 2
         pose = jnp.array([-middle[0], -middle[1], -low[2], 1, 0, 0, 0])
         return [_Panel("", np.asarray(outside(thing, pose, jnp.asarray(Sensor().gel.size), resolution=(400, 400))))]
-    if isinstance(thing, Prediction):
-        streams = {"visual": thing.visual, "tactile": thing.tactile}
-        panels = [_Panel(f"predicted {name}", np.asarray(_strip(x))) for name, x in streams.items() if x is not None]
-        if not panels:
-            raise ValueError("the prediction has no image, because its model predicts none: print it instead")
-        for panel in panels:
-            _check_single("Prediction", panel.values, 3)
-        return panels
     return [_Panel("", _image(_strip(thing)))]
+
+
+def _prediction(
+    prediction: Prediction,
+    given: Frame | Mapping[str, ArrayLike] | None,
+    truth: Frame | Mapping[str, ArrayLike] | None,
+    body: Body | None,
+    sensor: Sensor,
+) -> Figure:
+    """The figure of a prediction, see `show`."""
+    means = {name: np.asarray(x) for name in STREAMS if (x := getattr(prediction, name)) is not None}
+    if not means:
+        raise ValueError("the prediction has no image, because its model predicts none: print it instead")
+    steps = next(iter(means.values())).shape[:-3]
+    if len(steps) > 1:
+        _check_single("Prediction", next(iter(means.values())), 3)
+    inputs, truths = _streams("given", given, ()), _streams("truth", truth, steps)
+    rows = dict[str, list[_Place]]()
+    for name, mean in means.items():
+        drawn = () if prediction.samples is None else np.asarray(getattr(prediction.samples, name))[:SAMPLES]
+        row: list[_Place] = [(head, x.get(name)) for head, x in (("input", inputs), ("truth", truths)) if x]
+        row += [(f"sample {k + 1}", _strip(sample)) for k, sample in enumerate(drawn)]
+        rows[name] = [*row, ("mean" if len(drawn) else "predicted", _strip(mean))]
+    if max(map(len, rows.values())) == 1 or math.prod(steps) > 1:
+        figure = _row([_Panel(f"{k}: {head}", x) for k, row in rows.items() for head, x in row if x is not None])
+    else:
+        figure = _grid(rows)
+    if body is not None:
+        _check_single("Body", body.vertices, 2)
+        poses = prediction.pose if prediction.samples is None else prediction.samples.pose
+        if poses is None or "visual" not in inputs or "visual" not in rows:
+            lacking = "the prediction has no pose" if poses is None else "`given` has no visual image"
+            raise ValueError(f"{lacking}, and outlines need a pose and a visual image: leave out `body`")
+        shape = inputs["visual"].shape[:2]
+        window = given.window if isinstance(given, Frame) else optics.full_window(sensor.camera, shape)
+        ends = np.asarray(poses).reshape(-1, *steps, 7)
+        draw_outlines(figure.axes[0], sensor.camera, body, ends[:, -1] if steps else ends, window=window, shape=shape)
+    return figure
+
+
+def _streams(
+    argument: str, value: Frame | Mapping[str, ArrayLike] | None, steps: tuple[int, ...]
+) -> dict[str, np.ndarray]:
+    """The images of both streams in the argument `given` or `truth`, with one frame for each of the steps."""
+    if value is None:
+        return {}
+    every = value if isinstance(value, Mapping) else {name: getattr(value, name, None) for name in STREAMS}
+    images: dict[str, Any] = {name: every[name] for name in STREAMS if every.get(name) is not None}
+    if not images:
+        raise TypeError(
+            f"`{argument}` is a {type(value).__name__} without images: give a Frame, or a mapping with the image "
+            "`visual`, `tactile` or both"
+        )
+    for name, image in images.items():
+        if np.shape(image)[:-3] not in (steps, steps if math.prod(steps) > 1 else ()):
+            raise ValueError(
+                f"the {name} image of `{argument}` has shape {np.shape(image)}, but it must be "
+                f"({', '.join([*map(str, steps), 'height', 'width', '3'])})"
+            )
+    return {name: _image(_strip(image)) for name, image in images.items()}
+
+
+def _grid(rows: Mapping[str, Sequence[_Place]]) -> Figure:
+    """A figure with a row of images for each stream. The mean beside samples is small."""
+    heads = [head for head, _ in next(iter(rows.values()))]
+    widths = [_SMALL if head == "mean" else 1 for head in heads]
+    size = (_CELL * (sum(widths) + 0.2), _CELL * len(rows) + 0.4)
+    figure = NotebookFigure(figsize=size, layout="constrained")
+    grid = figure.subplots(len(rows), len(heads), squeeze=False, width_ratios=widths)
+    for line, (name, row) in zip(grid, rows.items(), strict=True):
+        line[0].set_ylabel(name, fontsize=9)
+        for axes, (_, image) in zip(line, row, strict=True):
+            axes.set(xticks=[], yticks=[])
+            axes.spines[:].set_visible(False)
+            if image is not None:
+                axes.imshow(image)
+    for axes, head in zip(grid[0], heads, strict=True):
+        axes.set_title(head, fontsize=9)
+    return figure
 
 
 def _strip(images: Any) -> Any:

@@ -66,28 +66,6 @@ def test_an_animation_draws_the_moment_below_the_force(tmp_path, sign):
     assert not len(blue_rows(pages[-1], 0))  # no force: the three curves lie on each other, the last one is on top
 
 
-def test_predictions_show_input_truth_mean_and_four_samples_of_both_streams(tmp_path, drawn):
-    test, predicted = judged(k=5)
-    figures.predictions(tmp_path / "a.png", test, predicted, num=2, title="t", scenario=sts.physics.Freefall())
-    axes = np.array(drawn[0].axes).reshape(4, 7)  # two items, each visual and tactile
-    heads = ["input", "truth", "mean of samples", "sample 1", "sample 2", "sample 3", "sample 4"]
-    assert [axis.get_title() for axis in axes[0]] == heads
-    assert [axis.get_ylabel() for axis in axes[:, 0]] == [
-        "#0: rests\nvisual",
-        "tactile",
-        "#1: fell off\nvisual",
-        "tactile",
-    ]
-
-    def picture(row, column):
-        return np.asarray(axes[row, column].images[0].get_array())
-
-    np.testing.assert_allclose(picture(2, 0), test.visual[1, 0] / 255, rtol=1e-6)
-    np.testing.assert_allclose(picture(3, 1), test.tactile[1, 1] / 255, rtol=1e-6)
-    np.testing.assert_allclose(picture(3, 2), predicted.tactile[1], rtol=1e-6)
-    np.testing.assert_allclose(picture(2, 6), predicted.samples.visual[3, 1] / 255, rtol=1e-6)
-
-
 def test_ends_are_drawn_in_millimetres_as_the_images_are_oriented(tmp_path, drawn):
     start, truth = np.array([0.01, -0.02, 0.1, 1, 0, 0, 0]), np.array([0.03, 0.04, 0.02, 1, 0, 0, 0])
     rerolled, sampled = (np.tile(truth, (k, 1)) for k in (16, 4))
@@ -146,23 +124,100 @@ def test_a_column_is_chosen_for_each_class_and_then_for_each_object():
     assert figures.one_of_each(test, ("fork", "bottle", "bottle"), 3).tolist() == [2, 0, 4]
 
 
-def test_a_pose_sheet_shows_inputs_predictions_and_truth(tmp_path, drawn):
-    test, predicted = judged()
+def texts(figure):
+    return [text.get_text() for text in figure.texts]
+
+
+def side(axis):
+    """Side of an image on the sheet (inches)."""
+    return axis.get_position().height * axis.figure.get_figheight()
+
+
+def test_a_pose_sheet_shows_inputs_truth_four_samples_and_a_small_mean(tmp_path, drawn):
+    test, predicted = judged(k=5)
     items = np.array([0, 3])
     figures.pose_sheet(tmp_path / "a.png", test, predicted, items, size=(0.15, 0.15), **SCENE)
-    rows = [test.visual[items, 0], test.tactile[items, 0], predicted.visual[items], test.visual[items, 1]]
-    rows = [image for row in [*rows, predicted.tactile[items], test.tactile[items, 1]] for image in row]
-    for image, wanted in zip(shown(drawn[0]), rows, strict=True):
+    rows, labels = [test.visual[items, 0], test.tactile[items, 0]], ["visual input", "tactile input"]
+    for stream in ("visual", "tactile"):
+        rows.append(getattr(test, stream)[items, 1])
+        rows += list(getattr(predicted.samples, stream)[:4, items])
+        rows.append(getattr(predicted, stream)[items])
+        labels += [f"true {stream}", *(f"{stream} sample {k}" for k in (1, 2, 3, 4)), f"{stream} mean"]
+    for image, wanted in zip(shown(drawn[0]), [image for row in rows for image in row], strict=True):
         np.testing.assert_allclose(image, wanted / 255 if wanted.dtype == np.uint8 else wanted, rtol=1e-6)
-    texts = [text.get_text() for text in drawn[0].texts]
-    labels = [
-        "visual input",
-        "tactile input",
-        *(f"{w} {s}" for s in ("visual", "tactile") for w in ("predicted", "true")),
-    ]
-    assert [text for text in texts if text in labels] == labels
-    assert "bottle\nrests" in texts
-    assert "fork\nfell off" in texts
+    assert [text for text in texts(drawn[0]) if text in labels] == labels
+    assert texts(drawn[0])[-3:] == ["bottle\n#0\nrests", "fork\n#3\nfell off", "pose"]
+    sides = np.array([side(axis) for axis in drawn[0].axes if axis.images])
+    np.testing.assert_allclose(sides[[14, 15, 26, 27]], sides[0] / 2)
+    np.testing.assert_allclose(np.delete(sides, [14, 15, 26, 27]), sides[0])
+
+
+def test_a_prediction_without_samples_is_drawn_large_and_a_touch_without_contact_is_left_out(tmp_path, drawn):
+    test, predicted = judged()
+    test.contact[[0, 3], 0] = False
+    predicted = predicted._replace(samples=None)
+    figures.pose_sheet(tmp_path / "a.png", test, predicted, np.array([0, 3]), size=(0.15, 0.15), **SCENE)
+    labels = ["visual input", "true visual", "predicted visual", "true tactile", "predicted tactile"]
+    assert texts(drawn[0])[1:-3] == labels
+    np.testing.assert_allclose(shown(drawn[0])[4], predicted.visual[0], rtol=1e-6)
+    assert len({round(side(axis), 6) for axis in drawn[0].axes if axis.images}) == 1
+
+
+def test_a_red_arrow_is_the_velocity_that_a_jerk_gives(tmp_path, drawn):
+    test, predicted = judged()
+    jerks = np.tile(np.float32([2.0, 0, 0.25]), (6, 1))  # m/s^2 along x for 0.25 s
+    scene = {**SCENE, "scenario": sts.physics.Perturbed()}
+    test = test._replace(condition=jerks, outcome=np.ones(6, int))
+    figures.pose_sheet(tmp_path / "a.png", test, predicted, np.array([1]), size=(0.15, 0.15), **scene)
+    arrow = drawn[0].axes[0].texts[0]
+    np.testing.assert_allclose(np.subtract(arrow.xy, arrow.xyann), [-0.5, 0], atol=1e-6)  # 4 pixels are 4 m/s
+    assert "Red arrow" in texts(drawn[0])[0].replace("\n", " ")
+
+
+FORK = sts.objects.make(jax.random.key(0), "fork")
+LYING = np.array([0.02, -0.01, 0.004, np.cos(0.4), 0, 0, np.sin(0.4)], np.float32)
+
+
+@pytest.mark.parametrize("crop", [False, True])
+def test_a_silhouette_covers_the_pixels_that_the_sensor_segments(crop):
+    frame = sts.sense(sts.Sensor(), FORK, LYING, resolution=(128, 128), crop=crop)
+    inside = LYING - np.float32([0, 0, 1, 0, 0, 0, 0])
+    poses = np.stack([LYING, inside, np.nan * LYING])
+    masks = figures.silhouettes(sts.Sensor().camera, FORK, poses, window=frame.window, shape=(128, 128))
+    found, true = masks[0] > 0.5, np.asarray(frame.segmentation)
+    assert true.sum() > 300
+    assert (found & true).sum() / (found | true).sum() > (0.97 if crop else 0.94)  # along a rim one pixel wide
+    assert not masks[1:].any()
+
+
+def test_outlines_at_sampled_poses_lie_on_the_rims_of_their_segmentations(tmp_path, drawn):
+    test, predicted = judged(k=20)
+    pixels = np.zeros((6, 2, 64, 64, 3), np.uint8)
+    predicted.samples.pose[:, 3] = LYING
+    predicted.samples.pose[1:, 3] = np.nan
+    figures.pose_sheet(
+        tmp_path / "a.png",
+        test._replace(visual=pixels),
+        predicted,
+        np.array([3]),
+        size=(0.15, 0.15),
+        bodies=[FORK],
+        camera=sts.Sensor().camera,
+        **SCENE,
+    )
+    axis = drawn[0].axes[0]
+    filled, line = axis.collections
+    segmented = np.asarray(sts.sense(sts.Sensor(), FORK, LYING, resolution=(64, 64)).segmentation)
+    rows, columns = np.nonzero(segmented)
+    for drawing in (filled, line):
+        (left, top), (right, bottom) = drawing.get_paths()[0].get_extents().get_points()
+        np.testing.assert_allclose([left, right], [columns.min() - 0.5, columns.max() + 0.5], atol=0.75)
+        np.testing.assert_allclose([top, bottom], [rows.min() - 0.5, rows.max() + 0.5], atol=0.75)
+    centres = np.stack(np.meshgrid(np.arange(64), np.arange(64)), -1).reshape(-1, 2)
+    inside = filled.get_paths()[0].contains_points(centres).reshape(64, 64)
+    assert (inside & segmented).sum() / (inside | segmented).sum() > 0.85
+    assert axis.get_xlim() == (-0.5, 63.5)
+    assert "visual input and\npredicted ends" in texts(drawn[0])
 
 
 def test_the_predicted_frame_is_solid_and_the_true_one_dashed(drawn, tmp_path):
@@ -201,6 +256,7 @@ def test_a_frame_off_the_pad_is_named_and_an_outline_is_the_projected_hull(drawn
 
 def test_a_sheet_of_models_leaves_out_what_a_model_does_not_predict(tmp_path, drawn):
     test, both = judged()
+    both = both._replace(samples=None)
     models = {"VAE visual": Predicted(visual=both.visual), "VAE tactile": Predicted(tactile=both.tactile), "MVAE": both}
     figures.models_sheet(tmp_path / "a.png", test, models, np.array([1]), **SCENE)
     labels = [text.get_text() for text in drawn[0].texts][1:-1]
@@ -213,8 +269,8 @@ def test_a_crossed_sheet_predicts_each_stream_from_the_other(tmp_path, drawn):
     test, both = judged()
     from_touch, from_vision = Predicted(visual=both.visual), Predicted(tactile=both.tactile)
     figures.crossed_sheet(tmp_path / "a.png", test, from_touch, from_vision, np.array([2]), **SCENE)
-    wanted = [test.tactile[2, 0] / 255, both.visual[2], test.visual[2, 1] / 255]
-    wanted += [test.visual[2, 0] / 255, both.tactile[2], test.tactile[2, 1] / 255]
+    wanted = [test.tactile[2, 0] / 255, test.visual[2, 1] / 255, both.visual[2]]
+    wanted += [test.visual[2, 0] / 255, test.tactile[2, 1] / 255, both.tactile[2]]
     np.testing.assert_allclose(shown(drawn[0]), wanted, rtol=1e-6)
 
 
@@ -232,6 +288,24 @@ def test_a_strip_of_a_roll_out_has_the_truth_of_the_same_time(tmp_path, drawn):
     )
     heads = [text.get_text() for text in drawn[0].texts][-5:]
     assert heads == ["0.00 s\ninput", "0.20 s", "0.60 s", "1.40 s", "1.40 s\ndirect"]
+
+
+def test_a_strip_of_a_roll_out_has_sampled_courses_above_their_mean(tmp_path, drawn):
+    rng = np.random.default_rng(0)
+    images = dataset.Images(*(rng.random((6, 8, 8, 3)) for _ in range(2)), segmentation=None)
+
+    def sampled(k):
+        return Predicted(tactile=rng.random((3, 8, 8, 3)), samples=Predicted(tactile=rng.random((k, 3, 8, 8, 3))))
+
+    rolled, direct = [sampled(2) for _ in range(5)], sampled(3)
+    figures.rollout_strip(tmp_path / "a.png", np.arange(6), images, rolled, 1, direct=direct, num=2)
+    found, every = shown(drawn[0]), [rolled[0], rolled[4], direct]
+    np.testing.assert_allclose(found[:4], images.tactile[[0, 1, 5, 5]])
+    for k in (0, 1):
+        np.testing.assert_allclose(found[4 + 3 * k : 7 + 3 * k], [one.samples.tactile[k, 1] for one in every])
+    np.testing.assert_allclose(found[10:], [one.tactile[1] for one in every])
+    labels = ["true tactile", "tactile sample 1", "tactile sample 2", "tactile mean"]
+    assert texts(drawn[0])[1:5] == labels
 
 
 def test_a_sheet_is_a_small_picture(tmp_path):

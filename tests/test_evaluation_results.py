@@ -167,7 +167,7 @@ def test_a_deterministic_prediction_scores_its_error_and_the_sharpness_of_its_im
 
 def test_predictions_in_parts_are_joined_in_order():
     _, predicted = judged()
-    whole = evaluation.joined([evaluation.first(predicted, 4), evaluation.first(predicted, 2)])
+    whole = evaluation.joined([evaluation.take(predicted, slice(4)), evaluation.take(predicted, slice(2))])
     np.testing.assert_array_equal(whole.pose, predicted.pose[[0, 1, 2, 3, 0, 1]])
     np.testing.assert_array_equal(whole.samples.visual, predicted.samples.visual[:, [0, 1, 2, 3, 0, 1]])
 
@@ -198,7 +198,7 @@ def scored():
     """Items, and the scores of the baselines, of a distribution, and of one that has the first two items only."""
     (test, predicted), (train, _) = judged(), judged(8, seed=1)
     rows = evaluation.baselines(physics.Freefall(), train, test)
-    rows |= {"model": predicted, evaluation.CEILING: evaluation.first(predicted, 2)}
+    rows |= {"model": predicted, evaluation.CEILING: evaluation.take(predicted, slice(2))}
     outcomes = physics.Freefall.outcomes
     return test, {name: evaluation.score(row, test, outcomes=outcomes, metrics=OWN) for name, row in rows.items()}
 
@@ -315,7 +315,9 @@ def test_a_metric_of_some_items_needs_two_objects_among_these(scored):
 
 def test_there_is_no_interval_from_one_trajectory_of_a_sensor():
     one = TEST.take(slice(1))
-    summary = evaluation.image_summary({name: evaluation.first(row, 1) for name, row in IMAGES.items()}, one, num=5)
+    summary = evaluation.image_summary(
+        {name: evaluation.take(row, slice(1)) for name, row in IMAGES.items()}, one, num=5
+    )
     assert summary["visual"]["predictors"][COPY]["bce"]["low"] is None
     json.dumps(summary, allow_nan=False)
 

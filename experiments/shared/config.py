@@ -82,7 +82,8 @@ class Config:
     # that each object is also in the training data (trajectory, as in the paper). Each split has its own models and
     # table
     splits: tuple[Literal["object", "trajectory"], ...] = ("object",)
-    num_shown: int = 8  # number of held-out trajectories in the figures
+    # number of held-out trajectories in the figures, of objects of each class in turn, among those that are re-rolled
+    num_shown: int = 8
     image_size: int = 64  # side of the images that are predicted and evaluated (pixels)
     # number of samples of each prediction of the state-space model. The paper's models are evaluated by their mean
     num_samples: int = 16

@@ -57,20 +57,34 @@ def draw(
 ) -> list[Path]:
     """Draw the main model's predictions, the calibration of its outcomes, and its sampled positions at rest.
 
-    `rerolled` are poses at rest of re-rolls of the first held-out trajectories, shape (times, n, 7).
+    Args:
+        test: The n held-out trajectories that are shown, with images of any resolution.
+        shown: Their predictions, by title of the row.
+        rerolled: Poses at rest of their re-rolls, (times, n, 7).
     """
-    name, model, num = run.workdir.name, TITLES[run.main_model], min(run.config.num_shown, len(test.object))
-    drawn = []
+    name, model, collection = run.workdir.name, TITLES[run.main_model], run.config.collection
+    bodies, names, drawn = dataset.make_bodies(collection, test.object), dataset.class_names(collection), []
+    width, height = (float(side) for side in run.sensor.gel.size)
     for given, stem in (("visual", ""), ("all inputs", "-all")):
         predicted, head = shown.get(f"{model}, from {given}"), f"{name}, from {given}"
         if predicted is None:
             continue
         drawn.append(run.figures / f"predictions{stem}.png")
-        title, scenario = f"{head}: the first {num} held-out trajectories", run.config.collection.scenario
-        evaluation.figures.predictions(drawn[-1], test, predicted, num=num, title=title, scenario=scenario)
+        evaluation.figures.pose_sheet(
+            drawn[-1],
+            test,
+            predicted,
+            np.arange(len(test.object)),
+            scenario=collection.scenario,
+            names=names,
+            size=(width, height),
+            title=f"{head}: held-out trajectories",
+            bodies=bodies,
+            camera=None if collection.crop else run.sensor.camera,
+        )
         if predicted.samples is not None and predicted.samples.pose is not None:
             drawn.append(run.figures / f"ends{stem}.png")
-            _draw_ends(drawn[-1], head, run.sensor, test, predicted.samples.pose, rerolled[:, :num])
+            _draw_ends(drawn[-1], head, (width, height), test, predicted.samples.pose, rerolled)
     judged = {f"from {given}": scores.get(f"{model}, from {given}", {}) for given in JUDGED_SUBSETS}
     if any(evaluation.CALIBRATION in errors for errors in judged.values()):
         drawn.append(run.figures / "calibration.png")
@@ -79,14 +93,14 @@ def draw(
 
 
 def _draw_ends(
-    path: Path, head: str, sensor: sts.Sensor, test: dataset.Pairs, sampled: np.ndarray, rerolled: np.ndarray
+    path: Path, head: str, size: tuple[float, float], test: dataset.Pairs, sampled: np.ndarray, rerolled: np.ndarray
 ) -> None:
     """Draw sampled and re-rolled positions at rest for the start whose re-rolls have the widest spread."""
     spread = np.linalg.norm(rerolled[..., :2] - rerolled[..., :2].mean(0), axis=-1).mean(0)
-    item, (width, height) = int(spread.argmax()), sensor.gel.size
-    title = f"{head}: ends of #{test.trajectory[item]}, the start with the widest spread among the first {len(spread)}"
+    item = int(spread.argmax())
+    title = f"{head}: ends of #{test.trajectory[item]}, the start with the widest spread among those shown"
     poses = (*test.pose[item], rerolled[:, item], sampled[:, item])
-    evaluation.figures.ends(path, (float(width), float(height)), *poses, title=title)
+    evaluation.figures.ends(path, size, *poses, title=title)
 
 
 def draw_strip(path: Path, collection: dataset.Collection, sensor: sts.Sensor, data: dataset.Dataset) -> None:

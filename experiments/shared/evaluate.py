@@ -111,8 +111,9 @@ def evaluate(run: Run, data: dataset.Dataset, own: Extensions = NONE) -> str:
     pairs = _pairs(run, data, own)
     test, judge = pairs.test, evaluation.scorer(scenario, pairs.train, metrics=own.scored)
     with Bar() as bar:
-        predicted, shown = _scored(run, pairs, judge, bar)
         few = test.take(slice(config.num_rerolled))
+        items = evaluation.figures.one_of_each(few, dataset.class_names(config.collection), config.num_shown)
+        predicted, shown = _scored(run, pairs, judge, items, bar)
         total = config.rerolls * len(few.object)
         rerolls, rerolled = reroll(run, few, judge, lambda done: bar("re-roll", done, total))
         baselines = evaluation.baselines(scenario, pairs.train, test)
@@ -121,7 +122,7 @@ def evaluate(run: Run, data: dataset.Dataset, own: Extensions = NONE) -> str:
         bar("evaluate", len(predicted), len(predicted), "intervals done")
 
     logs = {TITLES[name]: training.records(run.folder(name)) for name in MODELS[config.model]}
-    figures = drawing.draw(run, test, scores, shown, rerolled)
+    figures = drawing.draw(run, pairs.given.take(items), scores, shown, rerolled[:, items])
     figures.append(run.figures / "training.png")
     evaluation.figures.training_curves(figures[-1], logs)
     if not run.suffix and len(data.full_trajectories()):
@@ -175,9 +176,9 @@ def _pairs(run: Run, data: dataset.Dataset, own: Extensions) -> SplitPairs:
 
 
 def _scored(
-    run: Run, pairs: SplitPairs, judge: Judge, bar: Bar
+    run: Run, pairs: SplitPairs, judge: Judge, items: np.ndarray, bar: Bar
 ) -> tuple[dict[str, evaluation.Scores], dict[str, evaluation.Predicted]]:
-    """The scores of each model for each subset of its inputs, and the first predictions, by title of the row."""
+    """The scores of each model for each subset of its inputs, and the predictions of `items`, by title of the row."""
     config, state, jobs = run.config, run.config.model == "statespace", []
     for name in MODELS[config.model]:
         predictor = sts.Predictor.load(run.folder(name))
@@ -198,7 +199,7 @@ def _scored(
             num_samples=config.num_samples if state else 0,
         )
         scores[title] = judge(row, pairs.test)
-        shown[title] = evaluation.first(row, config.num_shown)
+        shown[title] = evaluation.take(row, items)
     return scores, shown
 
 

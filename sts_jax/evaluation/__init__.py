@@ -17,7 +17,6 @@ from sts_jax.evaluation.figures.curves import error_curve as error_curve
 from sts_jax.evaluation.figures.motion import outside as outside
 from sts_jax.evaluation.predictions import TRUE_STATE as TRUE_STATE
 from sts_jax.evaluation.predictions import Predicted as Predicted
-from sts_jax.evaluation.predictions import first as first
 from sts_jax.evaluation.predictions import frequency as frequency
 from sts_jax.evaluation.predictions import joined as joined
 from sts_jax.evaluation.predictions import outcome_of_pose as outcome_of_pose
@@ -26,6 +25,7 @@ from sts_jax.evaluation.predictions import rollout as rollout
 from sts_jax.evaluation.predictions import rows_of as rows_of
 from sts_jax.evaluation.predictions import shares as shares
 from sts_jax.evaluation.predictions import subsets as subsets
+from sts_jax.evaluation.predictions import take as take
 from sts_jax.evaluation.predictions import train_share as train_share
 from sts_jax.evaluation.probes import probe as probe
 from sts_jax.evaluation.probes import probes_table as probes_table

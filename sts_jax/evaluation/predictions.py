@@ -38,9 +38,9 @@ class Predicted(NamedTuple):
     outcomes: np.ndarray | None = None  # int (c,): outcomes of the columns of `outcome_probability`, set by `score`
 
 
-def first(predicted: Predicted, count: int) -> Predicted:
-    """Return the prediction for the first `count` trajectories."""
-    return _mapped(lambda axis, leaf: leaf[:count] if axis == 0 else leaf[:, :count], predicted)
+def take(predicted: Predicted, rows: np.ndarray | slice) -> Predicted:
+    """Select trajectories of a prediction by indices, a bool mask `(n,)`, or a slice such as `slice(10)`."""
+    return _mapped(lambda axis, leaf: leaf[rows] if axis == 0 else leaf[:, rows], predicted)
 
 
 def joined(parts: Sequence[Predicted]) -> Predicted:
@@ -252,7 +252,7 @@ def _predicted(
         number = 0 if steps is None else 1 if last else steps
         frames = [_mapped(lambda axis, leaf, i=i: leaf.take(i, axis + 1), out) for i in range(number)]
         parts.append(frames or [out])
-    return [first(joined(groups), count) for groups in zip(*parts, strict=True)]
+    return [take(joined(groups), slice(count)) for groups in zip(*parts, strict=True)]
 
 
 def _predict_rows(

@@ -7,10 +7,11 @@ from sts_jax.evaluation.figures.curves import training_curves as training_curves
 from sts_jax.evaluation.figures.motion import SLOWER as SLOWER
 from sts_jax.evaluation.figures.motion import animation as animation
 from sts_jax.evaluation.figures.motion import strip as strip
-from sts_jax.evaluation.figures.pictures import SAMPLES as SAMPLES
+from sts_jax.evaluation.figures.outlines import draw_outlines as draw_outlines
+from sts_jax.evaluation.figures.outlines import silhouettes as silhouettes
 from sts_jax.evaluation.figures.pictures import comparison as comparison
-from sts_jax.evaluation.figures.pictures import predictions as predictions
 from sts_jax.evaluation.figures.pictures import side_by_side as side_by_side
+from sts_jax.evaluation.figures.sheets import SAMPLES as SAMPLES
 from sts_jax.evaluation.figures.sheets import crossed_sheet as crossed_sheet
 from sts_jax.evaluation.figures.sheets import models_sheet as models_sheet
 from sts_jax.evaluation.figures.sheets import one_of_each as one_of_each

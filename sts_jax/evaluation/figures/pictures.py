@@ -1,21 +1,15 @@
 """Figures of images in rows and columns, and the functions that all figures use."""
 
-import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
-from sts_jax import physics
-from sts_jax.dataset import Pairs
 from sts_jax.evaluation.gap import Streams
-from sts_jax.evaluation.predictions import Predicted, in_unit
 from sts_jax.storage import write_whole
 
-SAMPLES = 4  # number of samples that are shown for each prediction
 _PERCENTILE = 99.5  # percentile of the absolute differences at which their colour scale ends
 
 
@@ -33,52 +27,6 @@ def save(figure: plt.Figure, path: Path) -> None:
         write_whole(path, lambda temporary: figure.savefig(temporary, format="png", dpi=130))
     finally:
         plt.close(figure)
-
-
-def predictions(
-    path: Path, test: Pairs, predicted: Predicted, *, num: int, title: str, scenario: physics.Scenario
-) -> None:
-    """Draw the first image, the true last image, the prediction and its samples for some held-out trajectories.
-
-    A red arrow on the first image shows `Scenario.drift`, the velocity of a frictionless object relative to the pad. An
-    arrow for 1 m/s is as long as a quarter of the image's width.
-
-    Args:
-        predicted: Predictions for all trajectories of `test`, or for the first ones.
-    """
-    streams = [name for name in ("visual", "tactile") if getattr(predicted, name) is not None]
-    samples = predicted.samples or Predicted()
-    num = min(num, *(len(getattr(predicted, name)) for name in streams))
-    drawn = 0 if samples.visual is None and samples.tactile is None else SAMPLES
-    heads = ["input", "truth", "mean of samples" if drawn else "prediction", *(f"sample {k + 1}" for k in range(drawn))]
-    rows = len(streams) * num
-    drift = np.stack([scenario.drift(jnp.asarray(condition)) for condition in test.condition[:num]])
-    figure, axes = plt.subplots(rows, len(heads), figsize=(1.25 * len(heads) + 0.7, 1.25 * rows + 0.8), squeeze=False)
-    for row in range(rows):
-        item, stream = row // len(streams), streams[row % len(streams)]
-        truth, drawings = getattr(test, stream)[item], getattr(samples, stream)
-        pictures = [truth[0], truth[1], getattr(predicted, stream)[item]]
-        pictures += [] if drawings is None else list(drawings[:SAMPLES, item])
-        for column, axis in enumerate(axes[row]):
-            if column < len(pictures):
-                show(axis, in_unit(pictures[column]))
-            else:
-                axis.axis("off")
-            if row == 0:
-                axis.set_title(heads[column], fontsize=10)
-        label = stream
-        if row % len(streams) == 0:
-            label = f"#{test.trajectory[item]}: {scenario.named(int(test.outcome[item]))}\n{stream}"
-        axes[row, 0].set_ylabel(label, fontsize=9)
-        if stream == streams[0] and drift[item].any():
-            height, width = test.visual.shape[2:4]
-            middle = np.array([width - 1, height - 1]) / 2
-            tip = middle + drift[item] * width / 4
-            axes[row, 0].annotate("", tip, middle, arrowprops={"arrowstyle": "->", "color": "red"})
-    arrows = "\nred arrow: velocity over the pad that a freely sliding object receives" if drift.any() else ""
-    wrapped = textwrap.fill(title, int(11 * figure.get_figwidth()))  # about eleven letters fit into an inch
-    figure.suptitle(wrapped + arrows, fontsize=11)
-    save(figure, path)
 
 
 def comparison(

@@ -17,21 +17,25 @@ from matplotlib.patches import Patch, Polygon
 from PIL import Image
 from scipy.spatial import ConvexHull
 
-from sts_jax import geometry, physics
+from sts_jax import geometry, optics, physics
 from sts_jax.dataset import Images, Pairs
+from sts_jax.evaluation.figures.outlines import COLOUR, draw_outlines
 from sts_jax.evaluation.predictions import Predicted, in_unit
 from sts_jax.objects import Body
 from sts_jax.storage import write_bytes
 
 STREAMS = ("visual", "tactile")
+SAMPLES = 4  # number of samples that are shown for each prediction
 _SIDE, _TALL = 1.0, 1.05  # inches, side of an image and width of a pose, height of a pose
+_SMALL = 0.5  # inches, side of a mean below samples
 # Inches, width of the labels, height of a line of text and of the legend, times the scale of the sheet's text
 _LABEL, _LINE, _LEGEND = 1.2, 0.17, 0.32
 _FONT, _LARGEST = 8.5, 1.5  # points, size of the text, and largest scale, for wide sheets that a page shows smaller
 _GAP, _APART = 0.04, 0.12  # inches, between images, and between groups of rows
 _DPI = 128  # pixels per inch: a pixel of an image of 64 x 64 covers 2 x 2 pixels of the sheet
 _MOST_BYTES = 280_000
-_TRUE, _PREDICTED = "0.35", "tab:orange"  # colours of true and predicted images and outlines
+_TRUE, _PREDICTED = "0.35", COLOUR  # colours of true and predicted images and outlines
+_ARROW = {"arrowstyle": "->", "color": "red"}
 _PAD = (0.86, 0.86, 0.92)  # colour
 _AXES = ("tab:red", "tab:green", "tab:blue")  # colours of the x, y and z axis of a coordinate frame
 _ARM = 0.4  # length of the axes of a coordinate frame, as a share of the pad's width
@@ -45,6 +49,8 @@ class _Row(NamedTuple):
     label: str
     images: Sequence[np.ndarray | None]
     predicted: bool = False
+    small: bool = False
+    over: Callable[[Axes, int], None] | None = None  # draws over the image of a column
 
 
 def one_of_each(test: Pairs, names: Sequence[str], num: int) -> np.ndarray:
@@ -76,29 +82,49 @@ def pose_sheet(
     size: Sequence[float],
     title: str,
     bodies: Sequence[Body] | None = None,
+    camera: optics.Camera | None = None,
 ) -> None:
-    """Draw inputs, predictions and truth of some held-out trajectories, and their poses as coordinate frames.
+    """Draw inputs, truth and predictions of some held-out trajectories, and their poses as coordinate frames.
 
-    The predicted frame is solid, and the true frame is dashed, as in the paper. What the model does not predict is left
-    out.
+    A prediction with samples is drawn as four samples, and its mean is small. The predicted frame is solid, and the
+    true frame is dashed, as in the paper. What the model does not predict is left out, and so are tactile inputs if
+    nothing touches the pad. A red arrow on the visual input is `Scenario.drift`, the velocity over the pad that a
+    frictionless object receives. A quarter of the image is 1 m/s.
 
     Args:
         items: Indices of the trajectories in `test`, such as from `one_of_each`.
         names: Class of each object of the collection, from `dataset.class_names`.
         size: Size of the pad along x and y (m).
         bodies: The objects of `items`, such as from `dataset.make_bodies`, whose outlines are drawn too.
+        camera: Camera of the sensor, to draw the outlines at sampled poses over the visual input as well. None for
+            images that are cropped to the object.
     """
-    groups = [_inputs(test, items)]
+    drift = np.stack([scenario.drift(jnp.asarray(condition)) for condition in test.condition[items]])
+    shape, ends = test.visual.shape[2:4], (predicted.samples or predicted).pose
+    vision, touch = _inputs(test, items)
+
+    def over(axis: Axes, column: int) -> None:
+        if camera is not None and bodies is not None and ends is not None:
+            window, poses = optics.full_window(camera, shape), ends[..., items[column], :].reshape(-1, 7)
+            draw_outlines(axis, camera, bodies[column], poses, window=window, shape=shape)
+        if drift[column].any():
+            middle = np.array([shape[1] - 1, shape[0] - 1]) / 2
+            axis.annotate("", tuple(middle + drift[column] * shape[1] / 4), tuple(middle), arrowprops=_ARROW)
+
+    if camera is not None and bodies is not None and ends is not None:
+        vision = vision._replace(label="visual input and\npredicted ends")
+    groups = [[vision._replace(over=over), *([touch] if test.contact[items, 0].any() else [])]]
     for stream in STREAMS:
-        images = getattr(predicted, stream)
-        if images is not None:
-            groups.append([_Row(f"predicted {stream}", images[items], True), _true(test, stream, items)])
+        if getattr(predicted, stream) is not None:
+            groups.append([_true(test, stream, items), *_predicted(predicted, stream, items)])
 
     def draw(axis: Axes, column: int) -> None:
         item, body = items[column], None if bodies is None else bodies[column]
         assert predicted.pose is not None
         _draw_pose(axis, np.asarray(size), test.pose[item, 1], predicted.pose[item], body)
 
+    if drift.any():
+        title += ". Red arrow: velocity over the pad that a freely sliding object receives"
     heads = _heads(test, items, scenario, names)
     _sheet(path, groups, heads, title, pose=None if predicted.pose is None else draw, outlines=bodies is not None)
 
@@ -116,8 +142,8 @@ def models_sheet(
     """Draw inputs, truth and the predictions of several models. Arguments as for `pose_sheet`, predictions by model."""
     groups = [_inputs(test, items)]
     for stream in STREAMS:
-        images = {model: getattr(one, stream) for model, one in predicted.items()}
-        rows = [_Row(f"{model}\n{stream}", x[items], True) for model, x in images.items() if x is not None]
+        given = {model: one for model, one in predicted.items() if getattr(one, stream) is not None}
+        rows = [row for model, one in given.items() for row in _predicted(one, stream, items, f"{model}\n{stream}")]
         groups += [[_true(test, stream, items), *rows]] if rows else []
     _sheet(path, groups, _heads(test, items, scenario, names), title)
 
@@ -140,8 +166,12 @@ def crossed_sheet(
             "from_touch.visual or from_vision.tactile is None: give predictions of a model of both streams"
         )
     groups = [
-        [touch, _Row("visual\nfrom touch alone", from_touch.visual[items], True), _true(test, "visual", items)],
-        [vision, _Row("tactile\nfrom vision alone", from_vision.tactile[items], True), _true(test, "tactile", items)],
+        [touch, _true(test, "visual", items), *_predicted(from_touch, "visual", items, "visual\nfrom touch alone")],
+        [
+            vision,
+            _true(test, "tactile", items),
+            *_predicted(from_vision, "tactile", items, "tactile\nfrom vision alone"),
+        ],
     ]
     _sheet(path, groups, _heads(test, items, scenario, names), title)
 
@@ -181,18 +211,19 @@ def rollout_strip(
     if direct is not None:
         frames.append(len(time) - 1)
         heads.append(f"{time[-1]:.2f} s\ndirect")
-    groups = []
+    steps, groups = [rolled[k - 1] for k in chosen], []
+    every = steps if direct is None else [*steps, direct]
     for stream in STREAMS:
-        steps = [getattr(rolled[k - 1], stream) for k in chosen]
-        if any(step is None for step in steps):
+        if any(getattr(step, stream) is None for step in steps):
             continue
-        predicted: list[np.ndarray | None] = [None, *(step[item] for step in steps)]
-        if direct is not None:
-            end = getattr(direct, stream)
-            predicted.append(None if end is None else end[item])
-        groups.append(
-            [_Row(f"true {stream}", getattr(images, stream)[frames]), _Row(f"predicted {stream}", predicted, True)]
-        )
+        parts = [_predicted(one, stream, np.array([item])) if getattr(one, stream) is not None else [] for one in every]
+        rows = [_Row(f"true {stream}", getattr(images, stream)[frames])]
+        *samples, mean = parts[0]
+        for k, row in enumerate(samples):
+            drawn = [part[k].images[0] if k + 1 < len(part) else None for part in parts]
+            rows.append(row._replace(images=[None, *drawn]))
+        rows.append(mean._replace(images=[None, *(part[-1].images[0] if part else None for part in parts)]))
+        groups.append(rows)
     _sheet(path, groups, heads, title, last_apart=direct is not None)
 
 
@@ -204,8 +235,21 @@ def _true(test: Pairs, stream: str, items: np.ndarray) -> _Row:
     return _Row(f"true {stream}", getattr(test, stream)[items, 1])
 
 
+def _predicted(predicted: Predicted, stream: str, items: np.ndarray, label: str = "") -> list[_Row]:
+    """The rows of a prediction: the first samples and a small mean, or the mean alone."""
+    mean, samples = getattr(predicted, stream)[items], getattr(predicted.samples, stream, None)
+    if samples is None:
+        return [_Row(label or f"predicted {stream}", mean, True)]
+    head = f"{label}\n" if label else f"{stream} "
+    rows = [_Row(f"{head}sample {k + 1}", sample[items], True) for k, sample in enumerate(samples[:SAMPLES])]
+    return [*rows, _Row(f"{head}mean", mean, True, small=True)]
+
+
 def _heads(test: Pairs, items: np.ndarray, scenario: physics.Scenario, names: Sequence[str]) -> list[str]:
-    return [f"{names[test.object[item]]}\n{scenario.named(int(test.outcome[item]))}" for item in items]
+    """The class and the number of each trajectory, and how it ends."""
+    ends = [scenario.named(int(outcome)) for outcome in test.outcome[items]]
+    which = zip(test.object[items], test.trajectory[items], ends, strict=True)
+    return [f"{names[index]}\n#{trajectory}\n{end}" for index, trajectory, end in which]
 
 
 def _sheet(
@@ -224,7 +268,7 @@ def _sheet(
     width = label_width + len(heads) * (_SIDE + _GAP) + _APART
     wrapped = textwrap.fill(title, int(13 * width / scale))  # about thirteen letters fit into an inch
     above = scale * _LINE * (2.8 + wrapped.count("\n") + max(head.count("\n") for head in heads))
-    images = sum(len(rows) * (_SIDE + _GAP) + _APART for rows in groups)
+    images = sum(sum(_side(row) + _GAP for row in rows) + _APART for rows in groups)
     legend = _legend(outlines)
     lines = math.ceil(len(legend) / max(int(width / scale), 2))  # an entry needs about an inch
     height = above + images + (0 if pose is None else _TALL + scale * (_LEGEND + _LINE * (lines - 1)))
@@ -233,8 +277,9 @@ def _sheet(
     def left(column: int) -> float:
         return label_width + column * (_SIDE + _GAP) + _APART * (last_apart and column == len(heads) - 1)
 
-    def add(column: int, top: float, tall: float) -> Axes:
-        axis = figure.add_axes((left(column) / width, 1 - (top + tall) / height, _SIDE / width, tall / height))
+    def add(column: int, top: float, wide: float, tall: float) -> Axes:
+        start = left(column) + (_SIDE - wide) / 2
+        axis = figure.add_axes((start / width, 1 - (top + tall) / height, wide / width, tall / height))
         axis.set_xticks([])
         axis.set_yticks([])
         return axis
@@ -246,16 +291,18 @@ def _sheet(
     figure.text(0.5, 1 - 0.08 / height, wrapped, ha="center", va="top", fontsize=scale * 10)
     top = above
     for rows in groups:
-        for label, pictures, predicted in rows:
-            colour = _PREDICTED if predicted else _TRUE
-            name(label, top + _SIDE / 2, "tab:orange" if predicted else "black")
-            for column, image in enumerate(pictures):
+        for row in rows:
+            side, colour = _side(row), _PREDICTED if row.predicted else _TRUE
+            name(row.label, top + side / 2, _PREDICTED if row.predicted else "black")
+            for column, image in enumerate(row.images):
                 if image is None:
                     continue
-                axis = add(column, top, _SIDE)
+                axis = add(column, top, side, side)
                 axis.imshow(np.clip(in_unit(image), 0, 1), interpolation="nearest")
-                axis.spines[:].set(color=colour, linewidth=1.5 if predicted else 0.8)
-            top += _SIDE + _GAP
+                axis.spines[:].set(color=colour, linewidth=1.5 if row.predicted else 0.8)
+                if row.over is not None:
+                    row.over(axis, column)
+            top += side + _GAP
         top += _APART
     for column, head in enumerate(heads):
         place = ((left(column) + _SIDE / 2) / width, 1 - (above - 0.05) / height)
@@ -263,10 +310,15 @@ def _sheet(
     if pose is not None:
         name("pose", top + _TALL / 2, "black")
         for column in range(len(heads)):
-            pose(add(column, top, _TALL), column)
+            pose(add(column, top, _SIDE, _TALL), column)
         look = {"fontsize": scale * _FONT, "ncols": math.ceil(len(legend) / lines), "labelspacing": 0.2}
         figure.legend(handles=legend, loc="lower center", frameon=False, borderaxespad=0.2, **look)
     _save(figure, path)
+
+
+def _side(row: _Row) -> float:
+    """Side of the images of a row (inches)."""
+    return _SMALL if row.small else _SIDE
 
 
 def _draw_pose(axis: Axes, size: np.ndarray, true: np.ndarray, predicted: np.ndarray, body: Body | None) -> None:
@@ -321,8 +373,9 @@ def _save(figure: plt.Figure, path: Path) -> None:
         figure.savefig(buffer, format="png", dpi=_DPI, pil_kwargs={"optimize": True})
     finally:
         plt.close(figure)
-    if buffer.tell() > _MOST_BYTES:
-        few = Image.open(buffer).convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, 2, dither=Image.Dither.NONE)
-        buffer = io.BytesIO()
-        few.save(buffer, "png", optimize=True)
+    picture = Image.open(buffer).convert("RGB")
+    for method in (Image.Quantize.MEDIANCUT, Image.Quantize.MAXCOVERAGE):  # the second one has coarser greys
+        if buffer.tell() > _MOST_BYTES:
+            buffer = io.BytesIO()
+            picture.quantize(256, method, 2).save(buffer, "png", optimize=True)
     write_bytes(path, buffer.getvalue())
