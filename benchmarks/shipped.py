@@ -6,7 +6,7 @@
 An experiment has few held-out objects, so its intervals are wide. This command draws new objects, and simulates and
 renders four trajectories of each, which stay in the work directory. The calibration error of few trajectories is above
 0 even if the probabilities are exact, so the command also prints it for outcomes that are drawn from the model's own
-probabilities.
+probabilities. The pictures WORKDIR-visual.png and WORKDIR-all.png show predictions of one object of each class.
 """
 
 import dataclasses
@@ -18,6 +18,7 @@ import tyro
 
 import sts_jax as sts
 from benchmarks.instruments.experiments import EXPERIMENTS
+from experiments.shared import drawing
 from experiments.shared.datasets import collect
 from experiments.shared.evaluate import MAIN_SUBSETS
 from experiments.shared.terminal import Bar
@@ -41,6 +42,8 @@ SAMPLE_COLUMNS = {  # columns of the table of the samples
     "energy score (mm)": "energy",
     f"coverage of {100 * evaluation.metrics.LEVEL:g} %": "coverage",
 }
+SHOWN = 8  # trajectories in a picture
+PICTURES = {"from visual": "visual", "from all inputs": "all"}  # end of a picture's name, by what is given
 DRAWS = 200  # number of times that outcomes are drawn from the probabilities
 
 
@@ -90,22 +93,26 @@ def main(args: Args) -> str:
     scenario = EXPERIMENTS[args.model].COLLECTION.scenario
     predictor = _predictor(args, scenario)
     folder = args.workdir or Path("runs") / f"shipped-{args.model}"
-    made = collection(args)
-    data = collect(made, sts.Sensor(), folder)
+    made, sensor = collection(args), sts.Sensor()
+    data = collect(made, sensor, folder)
     rows = evaluation.rows_of(data, "object")
     size = EXPERIMENTS[args.model].DEFAULT.image_size
     train, given = dataset.reduced(data.pairs(rows["train"]), size), data.pairs(rows["test"])
     test = dataset.reduced(given, size)
     judge = evaluation.scorer(scenario, train)
+    items = evaluation.figures.one_of_each(test, dataset.class_names(made), SHOWN)
     scores = {title: judge(row, test) for title, row in evaluation.baselines(scenario, train, test).items()}
     every = evaluation.subsets(predictor.modalities)
     subsets = {title: every[title] for title in (f"from {given}" for given in MAIN_SUBSETS) if title in every}
     with Bar() as bar:
         for number, (given_by, subset) in enumerate(subsets.items()):
             bar("predict", number, len(subsets), given_by)
-            scores[given_by] = judge(
-                evaluation.predict(predictor, subset, given, scenario, num_samples=NUM_SAMPLES), test
-            )
+            row = evaluation.predict(predictor, subset, given, scenario, num_samples=NUM_SAMPLES)
+            scores[given_by] = judge(row, test)
+            if given_by in PICTURES:
+                path, shown = folder.with_name(f"{folder.name}-{PICTURES[given_by]}.png"), evaluation.take(row, items)
+                title = f"{args.model}, {given_by}: new objects"
+                drawing.draw_predictions(path, made, sensor, given.take(items), shown, title)
     notes = [
         f"Outcomes drawn from the model's probabilities {title}: calibration error "
         f"{if_calibrated(errors[evaluation.CALIBRATION][:, 0]):.3f}."

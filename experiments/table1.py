@@ -20,7 +20,7 @@ import numpy as np
 import tyro
 
 import sts_jax as sts
-from experiments.shared import cells, claims, evaluate, run
+from experiments.shared import cells, claims, drawing, evaluate, run
 from experiments.shared import config as common
 from experiments.shared.cells import NAMES, Cell, Config
 from experiments.shared.terminal import on_one_line, say
@@ -199,7 +199,6 @@ def draw_scene(
     test = scene.test.take(figures.one_of_each(scene.test, names, SHOWN))
     every = np.arange(len(test.object))
     look: dict[str, Any] = {"scenario": scenario, "names": names}
-    width, height = (float(side) for side in sensor.gel.size)
 
     def path(stem: str) -> Path:
         drawn.append(folder / f"{stem}.png")
@@ -210,14 +209,12 @@ def draw_scene(
         model: evaluation.predict(p, p.modalities, test, scenario, num_samples=drawings[model])
         for model, p in final.items()
     }
-    bodies = dataset.make_bodies(scene.collection, test.object)
-    camera = None if scene.collection.crop else sensor.camera
     some = every[: SHOWN // 3]
     for model in (model for model in SHEETS if model in ends):
         for stem, items in ((model, some), (f"{model}-large", every)):
-            outlines, title = [bodies[i] for i in items], f"{scene.name}: {NAMES[model]}, the last frame from the first"
-            more = {**look, "size": (width, height), "title": title, "bodies": outlines, "camera": camera}
-            figures.pose_sheet(path(f"predictions-{stem}"), test, ends[model], items, **more)
+            title = f"{scene.name}: {NAMES[model]}, the last frame from the first"
+            shown = test.take(items), evaluation.take(ends[model], items)
+            drawing.draw_predictions(path(f"predictions-{stem}"), scene.collection, sensor, *shown, title)
     papers = {NAMES[model]: ends[model] for model in cells.PAPER if model in ends}
     if papers:
         title = f"{scene.name}: the paper's models, the last frame from the first one"

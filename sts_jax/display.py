@@ -113,7 +113,7 @@ class _Panel(NamedTuple):
     colours: str | None = None  # name of the colour map, None for an RGB image
 
 
-def _panels(thing: Frame | Body | Prediction | ArrayLike) -> list[_Panel]:
+def _panels(thing: Frame | Body | ArrayLike) -> list[_Panel]:
     """The images of the figure of an item."""
     if isinstance(thing, Frame):
         _check_single("Frame", thing.depth, 2)
@@ -161,9 +161,11 @@ def _prediction(
     if body is not None:
         _check_single("Body", body.vertices, 2)
         poses = prediction.pose if prediction.samples is None else prediction.samples.pose
-        if poses is None or "visual" not in inputs or "visual" not in rows:
-            lacking = "the prediction has no pose" if poses is None else "`given` has no visual image"
-            raise ValueError(f"{lacking}, and outlines need a pose and a visual image: leave out `body`")
+        needed = {"a predicted pose": poses is not None, "a predicted visual image": "visual" in rows}
+        needed["a visual image in `given`"] = "visual" in inputs
+        if not all(needed.values()):
+            lacking = next(name for name, there in needed.items() if not there)
+            raise ValueError(f"the outlines of `body` need {lacking}, which is missing: leave out `body`")
         shape = inputs["visual"].shape[:2]
         window = given.window if isinstance(given, Frame) else optics.full_window(sensor.camera, shape)
         ends = np.asarray(poses).reshape(-1, *steps, 7)

@@ -32,6 +32,7 @@ def test_a_small_run_prints_the_metrics_of_every_input(tmp_path):
     assert "32 held-out trajectories of 8 objects" in text
     assert "| from visual and tactile |" in text
     assert "Touch removes" in text
+    assert {path.name for path in tmp_path.glob("*.png")} == {"work-visual.png", "work-all.png"}
     samples = text.split("# released: 16 samples of each prediction")[1]
     row = next(line for line in samples.splitlines() if line.startswith("| from all inputs |"))
     best, sharpness, energy, coverage = (float(cell.split()[0]) for cell in row.split("|")[2:-1])

@@ -116,7 +116,7 @@ def test_a_file_of_another_format_raises_an_error(tmp_path):
     ("thing", "panels"),
     [
         (FRAME, ["visual", "tactile", "depth (mm)", "pressure (kPa)"]),
-        (PREDICTION, ["predicted visual", "predicted tactile"]),
+        (PREDICTION, ["visual: predicted", "tactile: predicted"]),
         (FRAME.visual, [""]),
         (np.zeros((4, 5, 3), np.uint8), [""]),
     ],
@@ -132,6 +132,54 @@ def test_a_figure_has_the_panels_of_its_object(thing, panels):
     np.testing.assert_allclose(figure.axes[0].images[0].get_array(), image / (255 if image.dtype == np.uint8 else 1))
 
 
+def sampled(k, *steps, streams=("visual", "tactile"), seed=0):
+    """A prediction with random images, k samples and poses 9 to 12 cm above the pad."""
+    rng = np.random.default_rng(seed)
+    shapes = {"visual": (4, 6, 3), "tactile": (4, 6, 3), "pose": (7,)}
+
+    def values(*lead):
+        every = {name: rng.random((*lead, *steps, *shape)) for name, shape in shapes.items()}
+        every["pose"][..., 3:] = [1, 0, 0, 0]
+        every["pose"][..., :3] *= [0, 0, 0.03]
+        every["pose"][..., 2] += 0.09
+        latent = dict.fromkeys(("mean", "log_var"), jnp.zeros((*steps, 2)))
+        return {name: every[name] if name in (*streams, "pose") else None for name in shapes} | latent
+
+    return sts.Prediction(**values(), samples=sts.Prediction(**values(k)) if k else None)
+
+
+def test_a_prediction_has_a_row_of_each_stream_with_input_truth_four_samples_and_a_small_mean():
+    prediction, truth = sampled(5), {"tactile": np.full((8, 12, 3), 51, np.uint8)}
+    figure = sts.show(prediction, given=FRAME, truth=truth)
+    axes = np.array(figure.axes).reshape(2, 7)
+    heads = ["input", "truth", "sample 1", "sample 2", "sample 3", "sample 4", "mean"]
+    assert [axis.get_title() for axis in axes[0]] == heads
+    assert [axis.get_ylabel() for axis in axes[:, 0]] == ["visual", "tactile"]
+    for name, row in zip(("visual", "tactile"), axes, strict=True):
+        samples = getattr(prediction.samples, name)
+        true = [np.full((8, 12, 3), 0.2)] if name == "tactile" else []
+        wanted = [np.asarray(getattr(FRAME, name)), *true, *samples[:4], getattr(prediction, name)]
+        found = [axis.images[0].get_array() for axis in row if axis.images]
+        for image, expected in zip(found, wanted, strict=True):
+            np.testing.assert_allclose(image, expected, rtol=1e-6)
+    figure.draw_without_rendering()
+    widths = np.array([axis.get_position().width for axis in axes[0]])
+    np.testing.assert_allclose(widths[-1] / widths[:-1], 0.5, rtol=0.05)
+
+
+def test_a_prediction_of_one_stream_has_one_row_and_without_samples_a_large_mean():
+    prediction = sampled(0, streams=("tactile",))
+    figure = sts.show(prediction, truth=FRAME)
+    assert [axis.get_title() for axis in figure.axes] == ["truth", "predicted"]
+    np.testing.assert_array_equal(figure.axes[1].images[0].get_array(), prediction.tactile)
+    figure.draw_without_rendering()
+    first, second = (axis.get_position().width for axis in figure.axes)
+    assert first == pytest.approx(second, rel=0.01)
+    assert [axis.get_title() for axis in sts.show(sampled(2, streams=("visual",))).axes] == [
+        *("sample 1", "sample 2", "mean")
+    ]
+
+
 def test_the_steps_of_a_rollout_are_drawn_side_by_side():
     steps = jnp.stack([FRAME.visual, 1 - FRAME.visual, FRAME.tactile, FRAME.tactile])
     figure = sts.show(sts.Prediction(steps, 1 - steps, None, jnp.zeros((4, 2)), jnp.zeros((4, 2))))
@@ -142,6 +190,71 @@ def test_the_steps_of_a_rollout_are_drawn_side_by_side():
     np.testing.assert_array_equal(sts.show(steps).axes[0].images[0].get_array(), upper)
     with pytest.raises(ValueError, match=r"the Prediction has leading axes \(1, 4\)"):
         sts.show(sts.Prediction(steps[None], None, None, None, None))
+
+
+def test_a_rollout_has_a_strip_for_each_sample_below_its_input_and_truth():
+    prediction = sampled(2, 3, streams=("visual",))
+    truth = np.stack([FRAME.visual] * 3)
+    figure = sts.show(prediction, given=FRAME, truth={"visual": truth})
+    titles = [f"visual: {head}" for head in ("input", "truth", "sample 1", "sample 2", "mean")]
+    assert [axis.get_title() for axis in figure.axes] == titles
+    strips = [np.asarray(axis.images[0].get_array()) for axis in figure.axes]
+    assert [strip.shape for strip in strips] == [(4, 6, 3), *[(4, 18, 3)] * 4]
+    np.testing.assert_allclose(strips[1][:, 12:], FRAME.visual)
+    np.testing.assert_allclose(strips[3][:, 6:12], prediction.samples.visual[1, 1])
+    figure.draw_without_rendering()
+    boxes = [axis.get_position() for axis in figure.axes]  # the input is about as high as a step
+    assert boxes[0].height == pytest.approx(boxes[1].height, rel=0.1)
+    assert boxes[0].x0 == pytest.approx(boxes[1].x0, abs=0.01)
+    single = sts.show(sampled(2, 1, streams=("visual",)), truth=FRAME)  # a roll-out with last=True
+    assert [axis.get_title() for axis in single.axes] == ["truth", "sample 1", "sample 2", "mean"]
+
+
+@pytest.mark.parametrize("crop", [False, True])
+def test_outlines_over_the_input_are_where_the_sensor_would_see_the_object(crop):
+    poses = np.zeros((20, 7), np.float32)
+    poses[:, 2], poses[:, 3] = 0.06 - 0.002 * np.arange(20), 1
+    poses[:, 0] = np.linspace(-0.03, 0.03, 20)
+    prediction = sampled(20)
+    prediction = prediction._replace(samples=prediction.samples._replace(pose=poses))
+    sensor, start = sts.Sensor(), poses[8]
+    first = sts.sense(sensor, BODY, start, resolution=(64, 64), crop=crop)
+    axis = sts.show(prediction, given=first, body=BODY).axes[0]
+    fills = axis.collections[::2]
+    assert len(fills) == 16
+    centres = np.stack(np.meshgrid(np.arange(64), np.arange(64)), -1).reshape(-1, 2)
+    inside, true = fills[8].get_paths()[0].contains_points(centres).reshape(64, 64), np.asarray(first.segmentation)
+    assert true.sum() > 100
+    assert (inside & true).sum() / (inside | true).sum() > 0.93
+    rolled = prediction._replace(visual=np.zeros((2, 4, 6, 3)), tactile=None, samples=None, pose=poses[[0, 8]])
+    last = sts.show(rolled, given=first, body=BODY, sensor=sensor).axes[0].collections
+    np.testing.assert_array_equal(last[0].get_paths()[0].vertices, fills[8].get_paths()[0].vertices)
+
+
+BATCH = jax.tree.map(lambda x: jnp.stack([x, x]), FRAME)
+
+
+@pytest.mark.parametrize(
+    ("thing", "more", "error", "message"),
+    [
+        (FRAME, {"truth": FRAME}, ValueError, "truth is drawn beside a Prediction, but `thing` is a Frame"),
+        (BODY, {"body": BODY}, ValueError, "body is drawn beside a Prediction, but `thing` is a Body"),
+        (PREDICTION, {"truth": {"pose": np.zeros(7)}}, TypeError, "`truth` is a dict without images"),
+        (PREDICTION, {"given": BATCH}, ValueError, r"`given` has shape \(2, 4, 6, 3\), but it must be \(height, width"),
+        (
+            sampled(1, 3),
+            {"truth": FRAME},
+            ValueError,
+            r"`truth` has shape \(4, 6, 3\), but it must be \(3, height, width",
+        ),
+        (PREDICTION, {"given": FRAME, "body": BODY}, ValueError, "need a predicted pose, which .*: leave out `body`"),
+        (sampled(1), {"body": BODY}, ValueError, "need a visual image in `given`, which is missing"),
+        (sampled(0)._replace(visual=None, tactile=None), {}, ValueError, "the prediction has no image"),
+    ],
+)
+def test_what_cannot_be_drawn_with_a_prediction_is_named(thing, more, error, message):
+    with pytest.raises(error, match=message):
+        sts.show(thing, **more)
 
 
 def test_a_body_is_drawn_from_outside():

@@ -40,7 +40,7 @@ def executed(name: str) -> tuple[list[np.ndarray], str]:
         ("fit_a_pose", 2, r"blur  1\.5 mm: 0\.[01]\d\d mm and 0\.\d\d degrees off"),
         (
             "drop_train_predict",
-            5,
+            4,
             r"(?s)the predicted place is \d+ mm from the true one.*roll-out: \d+ mm from the true",
         ),
         (

@@ -62,29 +62,18 @@ def draw(
         shown: Their predictions, by title of the row.
         rerolled: Poses at rest of their re-rolls, (times, n, 7).
     """
-    name, model, collection = run.workdir.name, TITLES[run.main_model], run.config.collection
-    bodies, names, drawn = dataset.make_bodies(collection, test.object), dataset.class_names(collection), []
-    width, height = (float(side) for side in run.sensor.gel.size)
+    name, model, drawn = run.workdir.name, TITLES[run.main_model], []
     for given, stem in (("visual", ""), ("all inputs", "-all")):
         predicted, head = shown.get(f"{model}, from {given}"), f"{name}, from {given}"
         if predicted is None:
             continue
         drawn.append(run.figures / f"predictions{stem}.png")
-        evaluation.figures.pose_sheet(
-            drawn[-1],
-            test,
-            predicted,
-            np.arange(len(test.object)),
-            scenario=collection.scenario,
-            names=names,
-            size=(width, height),
-            title=f"{head}: held-out trajectories",
-            bodies=bodies,
-            camera=None if collection.crop else run.sensor.camera,
+        draw_predictions(
+            drawn[-1], run.config.collection, run.sensor, test, predicted, f"{head}: held-out trajectories"
         )
         if predicted.samples is not None and predicted.samples.pose is not None:
             drawn.append(run.figures / f"ends{stem}.png")
-            _draw_ends(drawn[-1], head, (width, height), test, predicted.samples.pose, rerolled)
+            _draw_ends(drawn[-1], head, run.sensor, test, predicted.samples.pose, rerolled)
     judged = {f"from {given}": scores.get(f"{model}, from {given}", {}) for given in JUDGED_SUBSETS}
     if any(evaluation.CALIBRATION in errors for errors in judged.values()):
         drawn.append(run.figures / "calibration.png")
@@ -92,15 +81,39 @@ def draw(
     return drawn
 
 
+def draw_predictions(
+    path: Path,
+    collection: dataset.Collection,
+    sensor: sts.Sensor,
+    test: dataset.Pairs,
+    predicted: evaluation.Predicted,
+    title: str,
+) -> None:
+    """Draw the predictions of some trajectories of a collection, with the outlines of its objects."""
+    width, height = sensor.gel.size
+    evaluation.figures.pose_sheet(
+        path,
+        test,
+        predicted,
+        np.arange(len(test.object)),
+        scenario=collection.scenario,
+        names=dataset.class_names(collection),
+        size=(float(width), float(height)),
+        title=title,
+        bodies=dataset.make_bodies(collection, test.object),
+        camera=None if collection.crop else sensor.camera,
+    )
+
+
 def _draw_ends(
-    path: Path, head: str, size: tuple[float, float], test: dataset.Pairs, sampled: np.ndarray, rerolled: np.ndarray
+    path: Path, head: str, sensor: sts.Sensor, test: dataset.Pairs, sampled: np.ndarray, rerolled: np.ndarray
 ) -> None:
     """Draw sampled and re-rolled positions at rest for the start whose re-rolls have the widest spread."""
     spread = np.linalg.norm(rerolled[..., :2] - rerolled[..., :2].mean(0), axis=-1).mean(0)
-    item = int(spread.argmax())
+    item, (width, height) = int(spread.argmax()), sensor.gel.size
     title = f"{head}: ends of #{test.trajectory[item]}, the start with the widest spread among those shown"
     poses = (*test.pose[item], rerolled[:, item], sampled[:, item])
-    evaluation.figures.ends(path, size, *poses, title=title)
+    evaluation.figures.ends(path, (float(width), float(height)), *poses, title=title)
 
 
 def draw_strip(path: Path, collection: dataset.Collection, sensor: sts.Sensor, data: dataset.Dataset) -> None:
