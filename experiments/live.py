@@ -7,9 +7,10 @@
     python -m experiments.live --replay runs/monday --loop                # predicts from a recording
     python -m experiments.live --headless --seconds 20 --save live.png    # without a page
 
-The command makes about ten predictions a second. The page shows the newest visual and tactile image, the predicted
-images of the object at rest, and the probability of each outcome, such as "topples" or "fell off". The page also shows
-whether the object touches the pad, and the rate and the latency of the predictions.
+The command makes about ten predictions a second. The page shows the newest visual and tactile image, four samples of
+the predicted images of the object at rest, and the probability of each outcome, such as "topples" or "fell off". The
+page also shows whether the object touches the pad or is at rest, and the rate and the latency of the predictions. When
+the object has come to rest, the prediction is the present.
 
 The default model was trained only on simulated objects of the class `camera`, which are small cameras that a hand holds
 and releases. At the first start, the compilation takes about two minutes for a twin and half a minute for the model.
@@ -20,7 +21,7 @@ import dataclasses
 import itertools
 import tempfile
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -30,8 +31,8 @@ import tyro
 
 import sts_jax as sts
 from experiments.shared import drawing, interrupts, terminal
-from experiments.shared.device import own_twin
-from experiments.shared.live import Image, Live, Seen, Views, panel
+from experiments.shared.device import moving, own_twin
+from experiments.shared.live import Image, Live, Views, follow, panel
 from experiments.shared.page import LivePage
 from experiments.shared.terminal import say
 from sts_jax import hardware
@@ -77,9 +78,9 @@ class Config:
 class Source(NamedTuple):
     """The source of the live images."""
 
-    name: str  # description for the title of the page
     sensor: hardware.STS | hardware.Replay  # device or recording, not yet connected
     file: Path  # path of the sensor file or of its folder
+    body: sts.objects.Body | None = None  # the body in view, if it is known
 
 
 def check(config: Config) -> None:
@@ -96,20 +97,25 @@ def check(config: Config) -> None:
         drawing.check_picture(config.save)
 
 
+def title(config: Config) -> str:
+    """The source of the images and the model, for the page."""
+    source = "a digital twin of the sensor" if config.sensor is None else f"the sensor of {config.sensor}"
+    source = source if config.replay is None else f"a recording in {config.replay}"
+    return f"{source}. Model: {config.model}"
+
+
 @contextlib.contextmanager
-def opened(config: Config) -> Iterator[Source]:
+def opened(config: Config, tell: Callable[[str], None]) -> Iterator[Source]:
     """Open the source that the options select. A digital twin runs until the end of the `with` block."""
     if config.replay is not None:
         replay = hardware.Replay(config.replay, speed=config.speed)
-        yield Source(f"a recording in {config.replay}", replay, config.sensor or config.replay)
+        yield Source(replay, config.sensor or config.replay)
     elif config.sensor is not None:
-        sensor = hardware.STS.from_file(config.sensor, camera=config.camera, leds=config.leds)
-        yield Source(f"the sensor of {config.sensor}", sensor, config.sensor)
+        yield Source(hardware.STS.from_file(config.sensor, camera=config.camera, leds=config.leds), config.sensor)
     else:
-        say("starting a digital twin. The first start compiles for about two minutes, later ones take half a minute")
-        with tempfile.TemporaryDirectory() as folder, own_twin(Path(folder)) as leds:
-            sensor = hardware.STS.from_file(folder, leds=leds)
-            yield Source("a digital twin of the sensor", sensor, Path(folder))
+        tell("starting a digital twin. The first start compiles for about two minutes, later ones take half a minute")
+        with tempfile.TemporaryDirectory() as folder, own_twin(Path(folder)) as (leds, hand), moving(hand):
+            yield Source(hardware.STS.from_file(folder, leds=leds), Path(folder), hand.body)
 
 
 def images(config: Config, source: Source) -> Generator[hardware.Shot, None, None]:
@@ -134,24 +140,20 @@ def images(config: Config, source: Source) -> Generator[hardware.Shot, None, Non
     say("the replay has ended")
 
 
-def follow(config: Config, source: Source, predictor: sts.Predictor, page: LivePage | None) -> None:
+def predict(config: Config, source: Source, predictor: sts.Predictor, page: LivePage | None) -> None:
     """Connect the source, and show and predict from its images until it ends or the user quits."""
     views = Views.load(source.file, divided=config.flat)
-    newest, shown, moments = dict[str, hardware.Shot](), dict[str, Image](), list[Image]()
+    moments = list[Image]()
     with (
         Live(predictor, views, config.condition) as live,
         source.sensor,
         contextlib.closing(images(config, source)) as shots,
         interrupts.in_order(),
     ):
-        started_s = printed_s = time.monotonic()
+        live.body = source.body
+        printed_s = time.monotonic()
         try:
-            for shot in shots:
-                newest[shot.stream], shown[shot.stream] = shot, views.shown(shot.image)
-                if len(newest) < 2:
-                    continue
-                live.offer(**newest)
-                seen = Seen(**shown, time_s=shot.time_s, predicted=live.newest)
+            for seen in follow(live, shots):
                 if page is not None:
                     page.show(seen)
                 if seen.predicted is not None and time.monotonic() > printed_s + PRINT_S:
@@ -162,11 +164,7 @@ def follow(config: Config, source: Source, predictor: sts.Predictor, page: LiveP
                         print(", ".join(seen.predicted.lines()), flush=True)
         except KeyboardInterrupt:
             say("stopped")
-        duration_s, latency_ms = time.monotonic() - started_s, live.newest.latency_ms if live.newest else 0.0
-        say(
-            f"{live.made} predictions in {duration_s:.1f} s: {live.made / duration_s:.1f} per second, median latency "
-            f"{latency_ms:.0f} ms, {live.offered - live.made} images without a prediction of their own"
-        )
+        say(live.summary)
     if config.save is not None and moments:
         save(config.save, moments)
 
@@ -184,12 +182,15 @@ def main(config: Config) -> None:
         check(config)
         sts.enable_compilation_cache()
         predictor = sts.Predictor.load(config.model)
-        with opened(config) as source, contextlib.ExitStack() as stack:
-            page = None
+        with contextlib.ExitStack() as stack:
+            page, tell = None, say
             if not config.headless:
-                page = LivePage(config.host, config.port, title=f"{source.name}. Model: {config.model}")
+                page = LivePage(config.host, config.port, title=title(config))
                 stack.callback(page.close)
-            follow(config, source, predictor, page)
+                tell = page.tell
+            source = stack.enter_context(opened(config, tell))
+            tell("loading the model and connecting the sensor")
+            predict(config, source, predictor, page)
 
 
 if __name__ == "__main__":

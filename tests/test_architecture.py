@@ -13,11 +13,11 @@ ROOMS = [
     for name, paths, lines, budget in re.findall(r"^\| ([^|`]+) \| (`[^|]+) \| ([\d,]+) \| ([\d,]+) \|$", PAGE, re.M)
 ]
 TOTALS = {
-    "library without hardware": 26_210,
-    "hardware": 5_080,
-    "experiments": 6_880,
+    "library without hardware": 25_980,
+    "hardware": 5_110,
+    "experiments": 7_190,
     "benchmarks": 5_800,
-    "tests": 24_780,
+    "tests": 24_900,
 }
 
 

@@ -151,6 +151,7 @@ def test_log_agrees_with_the_acknowledged_lights_and_repeats_with_the_seed(tmp_p
         (lambda path: twin.Imperfections(full_well=0.0), r"full_well and jpeg_quality must be > 0"),
         (lambda path: twin.Twin(picture(), rate=100.0), r"rate must be in .*imperfections.exposure_s = 83"),
         (lambda path: twin.Twin(picture()).command("hold"), "does not change"),
+        (lambda path: twin.Twin(picture()).choose("fork"), "has no object to replace by a fork: use an ObjectScene"),
         (lambda path: (device := twin.Twin(picture())).step(1.0) or twin.Served(device), "make a new Twin"),
         (lambda path: twin.Served(twin.Twin(picture()), link=path), "not a symbolic link"),
         (lambda path: make_twin(TwinConfig(object_class="unicorn")), "must be one of"),
@@ -210,6 +211,27 @@ def test_ends_are_the_frame_of_sense(held):
         assert np.abs(blender.frame(ends, light) - expected).max() <= 1.1
     empty = fresh.ends(twin.Seen(twin.Phase.EMPTY, -1, 0, None), blender)
     assert empty.visual.std() < ends.visual.std()
+
+
+@pytest.mark.slow
+def test_another_object_is_held_from_the_next_hold_on():
+    camera, fork = (sts.objects.make(jax.random.key(seed), name) for seed, name in ((0, "camera"), (5, "fork")))
+    scene, seen = twin.ObjectScene(camera, resolution=(24, 32), seed=2), []
+    with twin.Twin(scene, imperfections=PERFECT) as device:
+        for command in ("hold", "choose", "release", "hold"):
+            if command == "choose":
+                device.choose("fork", 5)
+            else:
+                device.command(command)
+            seen.append(device.capture())
+    assert [truth.trajectory for truth, _ in seen] == [0, 0, 0, 1]
+    np.testing.assert_array_equal(seen[0][1], seen[1][1])  # the camera is still held
+    for (truth, image), body in zip(seen, [camera, camera, camera, fork], strict=True):
+        if truth.phase == "held":
+            motion = scene._motion(truth.trajectory)
+            pose, wrench = jnp.asarray(truth.pose), jnp.asarray(motion.wrench[truth.frame])
+            expected = 255 * np.asarray(sts.sense(scene.sensor, body, pose, wrench, resolution=(24, 32)).visual)
+            assert np.abs(image - expected).max() <= 1.1
 
 
 # ---- Served to other processes
@@ -310,6 +332,16 @@ def test_commands_and_state_over_http(held):
         with urllib.request.urlopen(server.url + "/state", timeout=30) as answer:
             assert json.load(answer)["pose"] == list(device.state.pose)
         for path, code, words in (("/release", 400, "send 'hold' first"), ("/jump", 404, "is not one of GET /camera")):
+            with pytest.raises(urllib.error.HTTPError) as found:
+                post(server, path)
+            with found.value as answer:
+                assert answer.code == code
+                assert words in json.load(answer)["error"]
+        for path, code, words in (
+            ("/choose?class=unicorn&seed=1", 400, "must be one of"),
+            ("/choose?class=fork&seed=x", 400, "'x'"),
+            ("/choose?class=fork", 404, "POST /choose?class=bottle&seed=3"),
+        ):
             with pytest.raises(urllib.error.HTTPError) as found:
                 post(server, path)
             with found.value as answer:

@@ -12,7 +12,7 @@ from PIL import Image
 
 import sts_jax as sts
 from experiments.shared import commissioning, drawing, interrupts
-from experiments.shared.device import FIELD_OF_VIEW, TwinConfig, make_twin
+from experiments.shared.device import FIELD_OF_VIEW, TwinConfig, TwinHand, make_twin
 from experiments.shared.page import CollectPage
 from experiments.shared.terminal import SEEDS, SIDES, Bar, Terminal, check_numbers, say
 from sts_jax import hardware, storage
@@ -128,6 +128,7 @@ def of_device(config: Collect, dataset: Path, stack: contextlib.ExitStack) -> Se
         someone = Terminal(config.count, listens=not config.automatic)
     else:
         page = CollectPage(config.host, config.port, count=config.count)
+        page.hand = TwinHand.of_camera(sensor.camera.source)
         someone = stack.enter_context(contextlib.closing(page))
     say("connecting. Keep the pad empty, and do not move anything in view")
     stack.enter_context(sensor)

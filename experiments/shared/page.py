@@ -1,4 +1,4 @@
-"""The browser pages of `experiments.real collect` and `experiments.live`.
+"""The browser pages of `experiments.real collect`, `experiments.live` and `experiments.demo`.
 
 Other sites in the same browser can neither see the images nor press the buttons (`hardware.web`). Actions need an HTTP
 header that only the page itself can send, too.
@@ -13,16 +13,23 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import cv2
+import jax.numpy as jnp
+import numpy as np
 
+from experiments.shared.device import TwinHand
 from experiments.shared.live import Image, Seen
-from experiments.shared.terminal import say
-from sts_jax.hardware import Action, View, web
+from experiments.shared.terminal import SEEDS, say
+from sts_jax import objects, physics
+from sts_jax.evaluation import metrics
+from sts_jax.hardware import Action, View, twin, web
 
 _WIDEST = 820  # largest width of the images in the page (pixels)
 _QUALITY = 80  # JPEG quality
 _INTERVAL_S = 0.1  # time between two images of a stream (s)
 _LAST_S = 0.4  # time at the end in which open pages can request the last facts (s)
 _LARGEST = 1000  # largest size of a request's content (bytes)
+# time after which all arriving images show a held object (s). It is longer than the lag of the twin's camera
+_FRESH_S = 0.3
 
 State = TypeVar("State")  # what a page shows
 
@@ -42,13 +49,14 @@ class Page(abc.ABC, Generic[State]):
         self._changed = threading.Condition()
         self.state: State | None = None  # the newest state, or None before the first one
         self._number = 0  # number of changes of the state so far
-        self._facts = {**constants, "ended": False}
+        self._facts = {"starting": "connecting", **constants, "ended": False}
         self._server = web.Server(host, port, type("Handler", (_Handler,), {"page": self}))
         self.host, self.port = host, self._server.server_port
         self._thread = threading.Thread(target=self._server.serve_forever, name="page", daemon=True)
         self._thread.start()
         reach = "only this computer" if self._server.is_local else "EVERY computer that reaches this address"
-        say(f"open {self._server.url}/ in a browser. The page listens on {host}, so {reach} can {self.use}")
+        self.url = f"{self._server.url}/"
+        say(f"open {self.url} in a browser. The page listens on {host}, so {reach} can {self.use}")
 
     @abc.abstractmethod
     def facts(self, state: State) -> dict[str, Any]:
@@ -61,6 +69,11 @@ class Page(abc.ABC, Generic[State]):
     def pressed(self, state: State, content: Any) -> bool:
         """Accept an action of the page, such as a pressed button, or return False."""
         return False
+
+    def tell(self, text: str) -> None:
+        """Print what the program does before the first state, and show it on the page."""
+        say(text)
+        self._facts["starting"] = text
 
     def show(self, state: State) -> None:
         """Update the images and all other values in all open pages."""
@@ -160,6 +173,7 @@ class CollectPage(Page[View]):
     document = Path(__file__).with_name("page.html")
     streams = ("visual", "tactile")
     use = "watch and press the buttons"
+    hand: TwinHand | None = None  # the hand of the sensor, if it is a twin
     _action: Action | None = None
 
     def action(self) -> Action | None:
@@ -170,6 +184,8 @@ class CollectPage(Page[View]):
 
     def pressed(self, state: View, content: Any) -> bool:
         """Accept the action of a button, unless the page showed an old stage or trajectory. Stop always counts."""
+        if self.hand is not None and isinstance(content, dict) and content.get("hand") in twin.COMMANDS:
+            return self.hand.start(content["hand"])
         try:
             action, shown = Action(content["action"]), (content["stage"], content["number"])
         except (KeyError, TypeError, ValueError):
@@ -188,6 +204,7 @@ class CollectPage(Page[View]):
             "stage": state.stage.value,
             "ends": [end for end in ("initial", "final") if getattr(state, end) is not None],
             "age_s": None if pair is None else time.monotonic() - max(pair.visual.time_s, pair.tactile.time_s),
+            "hand": None if self.hand is None else self.hand.facts(),
         }
 
     def image(self, state: View, path: str) -> Image | None:
@@ -200,25 +217,78 @@ class CollectPage(Page[View]):
 
 
 class LivePage(Page[Seen]):
-    """The page of `experiments.live`: the live images, the predicted images, and facts about the predictions.
+    """The page of `experiments.live`: the live images, samples of the predicted images, and facts about them.
 
     The constant `title` names the source and the model.
     """
 
     document = Path(__file__).with_name("live_page.html")
-    streams = ("visual", "tactile", "predicted_visual", "predicted_tactile")
+    streams = ("visual", "tactile", "samples_visual", "samples_tactile")
 
     def facts(self, state: Seen) -> dict[str, Any]:
         """The rate, the latency, the contact and the outcomes."""
         if state.predicted is None:
             return {"waiting": True}
-        facts = state.predicted._asdict()
-        del facts["visual"], facts["tactile"]
+        names = ("outcomes", "contact", "occupied", "resting", "rate", "latency_ms", "time_s")
+        facts = {name: getattr(state.predicted, name) for name in names}
         return {**facts, "age_s": time.monotonic() - state.time_s}
 
     def image(self, state: Seen, path: str) -> Image | None:
-        """The newest image of a stream such as `visual` or `predicted_visual`."""
-        if path not in self.streams:
+        """The newest image of a stream, or a mean image such as `mean_visual`."""
+        if path in ("visual", "tactile"):
+            return getattr(state, path)
+        if path in self.streams or path in ("mean_visual", "mean_tactile"):
+            return getattr(state.predicted, path.removeprefix("mean_"), None)
+        return None
+
+
+class DemoPage(LivePage):
+    """The page of `experiments.demo`: that of `experiments.live`, with buttons that move the object of a twin.
+
+    The constant `classes` has the classes of the objects, and `note` is a sentence about the model.
+    """
+
+    use = "watch and press the buttons"
+    hand: TwinHand | None = None  # None: the twin has not started yet
+
+    def facts(self, state: Seen) -> dict[str, Any]:
+        """The facts of `LivePage`, the hand, which buttons can be pressed, and what happened after the release."""
+        facts, hand = super().facts(state), self.hand
+        if hand is None or state.predicted is None:
+            return {**facts, "waiting": True}
+        return {
+            **facts,
+            "hand": {**hand.facts(), "can": [command for command in twin.COMMANDS if self._can(state, command)]},
+            "let_go": hand.let_go,
+            "happened": self._happened(state),
+        }
+
+    def pressed(self, state: Seen, content: Any) -> bool:
+        """Start the command of a button, if it is possible now."""
+        try:
+            command, category, seed = content["hand"], content.get("class"), int(content.get("seed", 0))
+        except (AttributeError, KeyError, TypeError, ValueError):
+            return False
+        known = category is None or (category in objects.CATEGORIES and SEEDS[0] <= seed <= SEEDS[1])
+        if self.hand is None or not known or not self._can(state, command):
+            return False
+        return self.hand.start(command, category if command == "hold" else None, seed)
+
+    def _can(self, state: Seen, command: str) -> bool:
+        """Whether a button can be pressed. A release needs a prediction from images of the held object."""
+        hand, found = self.hand, state.predicted
+        if hand is None or hand.doing is not None or command not in twin.COMMANDS:
+            return False
+        if command == "release":
+            return found is not None and hand.held_s is not None and found.time_s > hand.held_s + _FRESH_S
+        return True
+
+    def _happened(self, state: Seen) -> dict[str, Any] | None:
+        """Whether the released object fell off, and how far from the predicted centre it is at rest (mm)."""
+        hand, found = self.hand, state.predicted
+        assert hand is not None
+        if not hand.let_go or hand.state["phase"] != "still" or found is None or found.pose is None:
             return None
-        stream = path.removeprefix("predicted_")
-        return getattr(state if stream == path else state.predicted, stream, None)
+        pose = np.asarray(hand.state["pose"], np.float32)
+        error_mm = 1e3 * float(metrics.position_error(found.pose[None], pose[None])[0])
+        return {"fell_off": bool(physics.fell_off(jnp.asarray(pose))), "error_mm": error_mm}

@@ -13,4 +13,5 @@ from sts_jax.hardware.twin.scene import Phase as Phase
 from sts_jax.hardware.twin.scene import Picture as Picture
 from sts_jax.hardware.twin.scene import Scene as Scene
 from sts_jax.hardware.twin.scene import Seen as Seen
+from sts_jax.hardware.twin.served import COMMANDS as COMMANDS
 from sts_jax.hardware.twin.served import Served as Served

@@ -144,6 +144,12 @@ class Twin:
                 self.scene.command(command, self.now_s)
         return self.state
 
+    def choose(self, category: str, seed: int = 0) -> State:
+        """Replace the object by another one, such as ("bottle", 3), from the next command `hold` on."""
+        with self._commands:
+            self.scene.choose(category, seed)
+        return self.state
+
     def receive(self, data: bytes = b"") -> bytes:
         """Pass bytes from the host to the LED controller, with its watchdog. Returns the bytes that it sends back."""
         with self._lock:

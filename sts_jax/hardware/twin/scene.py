@@ -16,7 +16,7 @@ import numpy as np
 from sts_jax import physics
 from sts_jax.frame import sense
 from sts_jax.hardware.twin.photometry import Blender, Ends
-from sts_jax.objects import Body
+from sts_jax.objects import Body, make
 from sts_jax.sensor import Sensor
 
 MOTION_RATE = 10.0  # rendered poses per second of a moving object, in views of up to _MOTION_PIXELS
@@ -68,6 +68,10 @@ class Scene(abc.ABC):
         """Change the scene from a time on (s), which does not decrease between calls."""
         raise ValueError(f"command is {command!r}, but a {type(self).__name__} does not change: use an ObjectScene")
 
+    def choose(self, category: str, seed: int) -> None:
+        """Replace the object from the next command `hold` on. Must not run at the same time as `prepare`."""
+        raise ValueError(f"a {type(self).__name__} has no object to replace by a {category}: use an ObjectScene")
+
 
 class Picture(Scene):
     """A scene that never changes, such as a calibration board: its sRGB images with the LEDs off and at full power."""
@@ -90,6 +94,7 @@ class Picture(Scene):
 class _Motion(NamedTuple):
     """One simulated trajectory."""
 
+    body: Body
     pose: np.ndarray  # mesh frame in the sensor frame: position (m) and quaternion, shape (frames, 7)
     wrench: np.ndarray  # force (N) and moment (N m) of the pad on the object, shape (frames, 6)
     rate: float  # frame rate of the simulation (frames/s)
@@ -148,7 +153,7 @@ class ObjectScene(Scene):
         self._key = jax.random.key(seed)
         self._events: list[tuple[float, Phase, int]] = [(-float("inf"), Phase.EMPTY, first - 1)]
         self._batches = 0
-        self._motions: list[_Motion] = []  # all trajectories so far, which take a few kilobytes each
+        self._motions: list[_Motion] = []  # all trajectories so far, which take a few kilobytes each, and their bodies
         self._rendered: dict[tuple[int, int], Ends] = {}  # images by trajectory and frame. (-1, 0) is the empty pad
         self._working = threading.Lock()  # lets one simulation or rendering run at a time
 
@@ -193,6 +198,15 @@ class ObjectScene(Scene):
         for key in [key for key in self._rendered if 0 <= key[0] < self._events[-1][2] - 1]:
             del self._rendered[key]
 
+    def choose(self, category: str, seed: int) -> None:
+        """Replace the object by `objects.make(jax.random.key(seed), category)`, from the next command `hold` on."""
+        body, (_, _, number) = make(jax.random.key(seed), category), self._events[-1]
+        with self._working:
+            self._body = body
+            del self._motions[number + 1 :]
+            for key in [key for key in self._rendered if key[0] > number]:
+                del self._rendered[key]
+
     def _motion(self, number: int) -> _Motion:
         """The trajectory with a number, which is simulated if necessary."""
         if number < len(self._motions):  # before the lock, so that nobody waits for a rendering in another thread
@@ -213,21 +227,21 @@ class ObjectScene(Scene):
         self._batches += 1
         batch = physics.simulate(key, self._body, self.sensor, self.scenario, num=_BATCH)
         settled = [(np.asarray(batch.pose[i]), np.asarray(batch.wrench[i])) for i in np.flatnonzero(batch.settled)]
-        return [_Motion(pose, wrench, self.scenario.rate, _rest(pose)) for pose, wrench in settled]
+        return [_Motion(self._body, pose, wrench, self.scenario.rate, _rest(pose)) for pose, wrench in settled]
 
     def _render(self, trajectory: int, frame: int, blender: Blender) -> Ends:
         """The images of one pose without light and at full light, rendered or from the cache."""
-        pose, wrench = _NOWHERE, np.zeros(6, np.float32)
+        body, pose, wrench = self._body, _NOWHERE, np.zeros(6, np.float32)
         if trajectory >= 0:
             motion = self._motion(trajectory)
-            pose, wrench = motion.pose[frame], motion.wrench[frame]
+            body, pose, wrench = motion.body, motion.pose[frame], motion.wrench[frame]
         if (ends := self._rendered.get((trajectory, frame))) is not None:
             return ends
         with self._working:
             ends = self._rendered.get((trajectory, frame))  # another thread may have rendered it meanwhile
             if ends is None:
                 state = jnp.asarray(pose), jnp.asarray(wrench)
-                images = sense(self.sensor, self._body, *state, resolution=self._resolution)
+                images = sense(self.sensor, body, *state, resolution=self._resolution)
                 ends = blender.ends(np.asarray(images.visual), np.asarray(images.tactile))
                 self._rendered[trajectory, frame] = ends
             return ends

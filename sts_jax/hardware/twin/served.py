@@ -10,13 +10,14 @@ import socket
 import threading
 import time
 import tty
+import urllib.parse
 from pathlib import Path
 
 from sts_jax.hardware import web
 from sts_jax.hardware.twin.device import Twin, TwinFrame
 
 CAMERA = "/camera"
-COMMANDS = ("hold", "release", "clear")
+COMMANDS = ("hold", "release", "clear")  # what the hand can do, see `ObjectScene`
 _WAIT_S = 0.1  # longest time until waiting threads notice that they must stop (s)
 _CLOSE_S = 1.0  # longest wait for clients when the server is closed (s)
 _TICK_S = 0.003  # longest wait for bytes, after which the watchdog is checked (s)
@@ -101,17 +102,21 @@ class _Handler(web.Handler):
             self._unknown()
 
     def do_POST(self) -> None:
-        command = self.path.removeprefix("/")
-        if command not in COMMANDS:
-            self._unknown()
-            return
+        command, _, query = self.path.removeprefix("/").partition("?")
+        twin, options = self.server.twin, dict(urllib.parse.parse_qsl(query))
         try:
-            self._json(200, dataclasses.asdict(self.server.twin.command(command)))
-        except ValueError as error:
+            if command in COMMANDS and not query:
+                self._json(200, dataclasses.asdict(twin.command(command)))
+            elif command == "choose" and options.keys() == {"class", "seed"}:
+                self._json(200, dataclasses.asdict(twin.choose(options["class"], int(options["seed"]))))
+            else:
+                self._unknown()
+        except (ValueError, OverflowError) as error:
             self._json(400, {"error": str(error)})
 
     def _unknown(self) -> None:
-        known = [f"GET {CAMERA}", "GET /state", *(f"POST /{name}" for name in COMMANDS)]
+        posts = [f"POST /{name}" for name in (*COMMANDS, "choose?class=bottle&seed=3")]
+        known = [f"GET {CAMERA}", "GET /state", *posts]
         self._json(404, {"error": f"the request {self.command} {self.path} is not one of {', '.join(known)}"})
 
     def _json(self, code: int, content: dict[str, object]) -> None:
