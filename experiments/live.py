@@ -5,7 +5,7 @@
     python -m experiments.live --camera URL --leds PORT --sensor bench    # the same sensor under other addresses
     python -m experiments.live --sensor bench --record runs/monday        # also records both streams
     python -m experiments.live --replay runs/monday --loop                # predicts from a recording
-    python -m experiments.live --headless --seconds 20 --save live.png    # without a page
+    python -m experiments.live --headless --seconds 20 --save live.webp   # without a page
 
 The command makes about ten predictions a second. The page shows the newest visual and tactile image, four samples of
 the predicted images of the object at rest, and the probability of each outcome, such as "topples" or "fell off". The

@@ -8,6 +8,7 @@ import struct
 import subprocess
 import sys
 import threading
+import time
 import urllib.error
 import urllib.request
 from pathlib import Path
@@ -216,22 +217,39 @@ def test_ends_are_the_frame_of_sense(held):
 @pytest.mark.slow
 def test_another_object_is_held_from_the_next_hold_on():
     camera, fork = (sts.objects.make(jax.random.key(seed), name) for seed, name in ((0, "camera"), (5, "fork")))
-    scene, seen = twin.ObjectScene(camera, resolution=(24, 32), seed=2), []
+    scene, blender, truths = twin.ObjectScene(camera, resolution=(24, 32), seed=2), twin.Blender(PERFECT), []
     with twin.Twin(scene, imperfections=PERFECT) as device:
         for command in ("hold", "choose", "release", "hold"):
             if command == "choose":
                 device.choose("fork", 5)
             else:
                 device.command(command)
-            seen.append(device.capture())
-    assert [truth.trajectory for truth, _ in seen] == [0, 0, 0, 1]
-    np.testing.assert_array_equal(seen[0][1], seen[1][1])  # the camera is still held
-    for (truth, image), body in zip(seen, [camera, camera, camera, fork], strict=True):
-        if truth.phase == "held":
-            motion = scene._motion(truth.trajectory)
-            pose, wrench = jnp.asarray(truth.pose), jnp.asarray(motion.wrench[truth.frame])
-            expected = 255 * np.asarray(sts.sense(scene.sensor, body, pose, wrench, resolution=(24, 32)).visual)
-            assert np.abs(image - expected).max() <= 1.1
+            device.step(0.1)
+            truths.append(device.capture()[0])
+    assert [truth.trajectory for truth in truths] == [0, 0, 0, 1]
+    for truth, body in zip(truths, [camera, camera, camera, fork], strict=True):
+        pose, wrench = jnp.asarray(truth.pose), jnp.asarray(scene._motion(truth.trajectory).wrench[truth.frame])
+        expected = 255 * np.asarray(sts.sense(scene.sensor, body, pose, wrench, resolution=(24, 32)).visual)
+        assert np.abs(blender.frame(scene.ends(truth, blender), 0.0) - expected).max() <= 1.1
+
+
+def test_closing_waits_for_a_command_that_renders():
+    scene, begun, rendered = picture(), threading.Event(), threading.Event()
+    scene.prepare = lambda command, blender: begun.set() or rendered.wait(60)
+    scene.command = lambda command, time_s: None
+    device = twin.Twin(scene)
+    device.run_on(time.monotonic)
+    command = threading.Thread(target=device.command, args=("release",))
+    closing = threading.Thread(target=device.close)
+    command.start()
+    assert begun.wait(60)
+    closing.start()
+    closing.join(0.1)
+    assert closing.is_alive()
+    rendered.set()
+    closing.join(60)
+    assert not closing.is_alive()
+    command.join(60)
 
 
 # ---- Served to other processes

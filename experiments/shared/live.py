@@ -36,8 +36,8 @@ _GUIDE = hardware.GuideConfig()  # thresholds of contact and movement
 _TINT = 0.15  # opacity of a predicted outline's area
 _COLOUR = 255, 130, 0  # colour of the predicted outlines
 _SMALL = 240  # side of an image in a panel (pixels)
-_MEAN = 96  # side of a mean image in a panel (pixels)
-_LINE = 24  # height of a line of text (pixels)
+_MEAN = 88  # side of a mean image in a panel (pixels)
+_LINE = 23  # height of a line of text (pixels)
 
 Image = UInt8[np.ndarray, "height width 3"]
 Outline = Sequence[np.ndarray]  # closed lines around an area and around its holes, each (n, 1, 2) pixels

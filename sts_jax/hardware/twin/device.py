@@ -209,8 +209,9 @@ class Twin:
         return self._request(protocol.Ping(next(self._sequence)))
 
     def close(self) -> None:
-        """Close the files of the log. Closing twice is allowed."""
-        self._files.close()
+        """Wait for the end of a command, and close the files of the log. Closing twice is allowed."""
+        with self._commands:  # a thread that renders while Python ends would abort the process
+            self._files.close()
 
     def __enter__(self) -> "Twin":
         return self
