@@ -16,11 +16,10 @@ import cv2
 import jax
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, UInt8
-from scipy.spatial.transform import Rotation
 
 import sts_jax as sts
 from experiments.shared.device import TwinHand
-from sts_jax import hardware, optics
+from sts_jax import geometry, hardware, optics
 from sts_jax.hardware import Stage, collecting
 
 SIDE = 384  # side of the images that are shown (pixels)
@@ -97,14 +96,10 @@ def outlines(body: sts.objects.Body, poses: Float[np.ndarray, "n 7"], pinhole: o
 
     The gel is not modelled: rays are straight lines through the pinhole.
     """
-    found, distance = list[Outline](), float(pinhole.distance)
-    left, top, width, height = np.asarray(optics.full_window(pinhole, (SIDE, SIDE)))
-    for pose, turn in zip(poses, Rotation.from_quat(poses[:, [4, 5, 6, 3]]).as_matrix(), strict=True):
-        points = np.asarray(body.vertices) @ turn.T + pose[:3]
-        depth = points[:, 2] + distance
+    found = list[Outline]()
+    for pixels, depth in zip(*map(np.asarray, _projected(body.vertices, poses, pinhole)), strict=True):
         if depth.min() < pinhole.near:  # below the pad
             continue
-        pixels = (points[:, :2] * (distance / depth)[:, None] - (left, top)) / (width, height) * SIDE
         triangles, area = pixels[np.asarray(body.faces)], np.zeros((SIDE, SIDE), np.uint8)
         (x1, y1), (x2, y2) = (np.moveaxis(triangles[:, corner] - triangles[:, 0], -1, 0) for corner in (1, 2))
         seen = x1 * y2 - x2 * y1 < 0  # the surface is closed, so the faces towards the pinhole cover the whole area
@@ -112,6 +107,17 @@ def outlines(body: sts.objects.Body, poses: Float[np.ndarray, "n 7"], pinhole: o
             cv2.fillConvexPoly(area, triangle, 255)
         found.append(cv2.findContours(area, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)[0])
     return tuple(found)
+
+
+@jax.jit
+def _projected(
+    vertices: Float[Array, "v 3"], poses: Float[Array, "n 7"], pinhole: optics.Camera
+) -> tuple[Float[Array, "n v 2"], Float[Array, "n v"]]:
+    """Pixels and depths of vertices at some poses."""
+    window = optics.full_window(pinhole, (SIDE, SIDE))
+    return jax.vmap(lambda pose: optics.to_pixels(pinhole, window, (SIDE, SIDE), geometry.transform(pose, vertices)))(
+        poses
+    )
 
 
 def outlined(image: Image, outlines: tuple[Outline, ...]) -> Image:
