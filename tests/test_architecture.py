@@ -13,11 +13,11 @@ ROOMS = [
     for name, paths, lines, budget in re.findall(r"^\| ([^|`]+) \| (`[^|]+) \| ([\d,]+) \| ([\d,]+) \|$", PAGE, re.M)
 ]
 TOTALS = {
-    "library without hardware": 25_980,
+    "library without hardware": 26_210,
     "hardware": 5_110,
-    "experiments": 7_220,
+    "experiments": 7_260,
     "benchmarks": 5_800,
-    "tests": 24_970,
+    "tests": 25_170,
 }
 
 
