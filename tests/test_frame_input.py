@@ -86,6 +86,11 @@ UNLIKELY = [
 ]
 
 
+@jax.jit
+def traced(pose, wrench):
+    return sense(SENSOR, BODY, pose, wrench, resolution=(16, 16))
+
+
 @pytest.mark.parametrize(("pose", "wrench", "message"), UNLIKELY)
 def test_a_placement_that_is_probably_wrong_is_drawn_with_a_warning(pose, wrench, message):
     for kind in (np.asarray, jnp.asarray):
@@ -93,7 +98,7 @@ def test_a_placement_that_is_probably_wrong_is_drawn_with_a_warning(pose, wrench
         with pytest.warns(UserWarning, match=message) as caught:
             sense(SENSOR, BODY, *given, resolution=(16, 16))
         assert [warning.filename for warning in caught] == [__file__]
-    jax.jit(lambda pose: sense(SENSOR, BODY, pose, wrench, resolution=(16, 16)))(pose)  # not of traced values
+    traced(pose, wrench)  # no warning
 
 
 @pytest.mark.parametrize(
