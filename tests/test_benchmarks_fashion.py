@@ -14,6 +14,7 @@ needs_data = pytest.mark.skipif(not fashion.DATA.exists(), reason="needs Debian'
 SMALL = fashion.Args(latent=2, hidden=64, widths=(8, 8, 16, 16), epochs=1)
 
 
+@pytest.mark.slow
 @needs_data
 def test_a_few_steps_and_the_printed_evidence(tmp_path, capsys, monkeypatch):
     images, labels = fashion.read(fashion.DATA, "t10k")

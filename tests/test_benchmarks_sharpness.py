@@ -41,6 +41,7 @@ def test_a_condition_changes_one_thing(name, world, collection, scenario):
     assert differing(changed.collection.scenario, BASE.collection.scenario) == scenario
 
 
+@pytest.mark.slow
 def test_all_has_every_change_and_a_clear_skin_only_transmits():
     changed = sharpness.CONDITIONS["all"][1](BASE)
     assert differing(changed, BASE) == {"collection", "split", "skin"}

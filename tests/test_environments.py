@@ -52,6 +52,7 @@ def grasp(squeeze):
     yield from [RISE / 2] * 40
 
 
+@pytest.mark.slow
 def test_gymnasium_finds_no_fault(gym_lift):
     check_env(gym_lift)
 
@@ -107,6 +108,7 @@ def test_the_object_starts_on_the_table(gym_lift):
         )
 
 
+@pytest.mark.slow
 def test_the_interface_is_that_of_playground(lift):
     assert set(dir(lift)) >= MEMBERS
     assert [field.name for field in dataclasses.fields(State)] == ["data", "obs", "reward", "done", "metrics", "info"]

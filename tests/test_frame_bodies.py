@@ -98,6 +98,7 @@ def test_one_body_in_a_list_equals_the_body():
     assert set(np.unique(one.body)) == {-1, 0}
 
 
+@pytest.mark.slow
 def test_a_body_behind_another_is_hidden():
     screen = from_trimesh(trimesh.creation.box((0.06, 0.06, 0.005)))
     front, behind = (screen, at(0, 0, 0.0025), NOTHING), (BALL, at(0, 0, 0.04), NOTHING)
@@ -109,6 +110,7 @@ def test_a_body_behind_another_is_hidden():
     np.testing.assert_allclose(swapped.visual, both.visual, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_press_changes_only_the_imprint_of_its_body():
     box, pressed = (BOX, *PRESSED[0]), (BALL, *PRESSED[1])
     touching = many(box, (BALL, PRESSED[1][0], NOTHING))
@@ -125,6 +127,7 @@ def test_a_press_changes_only_the_imprint_of_its_body():
     assert float(sunk.depth.min()) < 0.1
 
 
+@pytest.mark.slow
 def test_bodies_of_different_size_classes_and_textures():
     fine = from_trimesh(trimesh.creation.icosphere(subdivisions=4, radius=0.015))
     items = [
@@ -147,6 +150,7 @@ def test_bodies_of_different_size_classes_and_textures():
 TILTS = [(90, 0, 0), (90, 0, 45), (80, 5, 30), (120, 10, 10), (180, 0, 0)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sensor", [SENSOR, TIP])
 def test_a_floor_that_begins_before_the_pinhole_equals_its_plane(sensor):
     floor, distance = from_trimesh(trimesh.creation.box((10, 8, 0.02))), 0.12
@@ -169,6 +173,7 @@ def test_a_floor_that_begins_before_the_pinhole_equals_its_plane(sensor):
         assert (seen & inside).sum() > 500
 
 
+@pytest.mark.slow
 def test_a_scene_of_large_and_small_faces_equals_embree():
     wall = from_trimesh(trimesh.creation.box((2.0, 1.5, 0.3)))
     turns = [Rotation.from_euler("xyz", angles, degrees=True) for angles in ((95, 20, 0), (10, 20, 30))]
@@ -186,6 +191,7 @@ def test_a_scene_of_large_and_small_faces_equals_embree():
     assert inner.sum() > 500
 
 
+@pytest.mark.slow
 def test_vmap_equals_a_loop_and_gradients_equal_finite_differences():
     bodies = [BOX, BALL]
     poses, wrenches = stacked(*PRESSED)

@@ -134,6 +134,7 @@ def test_a_textured_plane_in_perspective_equals_the_intersections_of_rays():
     np.testing.assert_allclose(shown[:, :2], 0.5 + there[inside] / 0.09, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_a_rod_narrower_than_a_pixel_may_cover_none_and_has_the_right_area_on_average():
     rod, places = from_trimesh(trimesh.creation.box((0.1, 0.001, 0.001))), np.linspace(0, 2 * 0.15 / 128, 14, False)
     for size, narrowest in ((128, 0), (256, 1)):  # pixels of 1.17 and 0.59 mm

@@ -143,6 +143,7 @@ POINTS = {
 }
 
 
+@pytest.mark.slow
 def test_the_derivative_along_all_parameters_together_equals_finite_differences():
     point = SENSORS["far"], at(0.0031, -0.0022, 0.0239, TURN), None  # in its place
     for _, stream, slope, numeric, defined in compare(point, BALL, False, together=True):

@@ -87,7 +87,7 @@ UNLIKELY = [
 
 
 @jax.jit
-def traced(pose, wrench):
+def drawn_inside_jit(pose, wrench):
     return sense(SENSOR, BODY, pose, wrench, resolution=(16, 16))
 
 
@@ -98,7 +98,7 @@ def test_a_placement_that_is_probably_wrong_is_drawn_with_a_warning(pose, wrench
         with pytest.warns(UserWarning, match=message) as caught:
             sense(SENSOR, BODY, *given, resolution=(16, 16))
         assert [warning.filename for warning in caught] == [__file__]
-    traced(pose, wrench)  # no warning
+    drawn_inside_jit(pose, wrench)  # no warning
 
 
 @pytest.mark.parametrize(

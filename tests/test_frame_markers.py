@@ -88,6 +88,7 @@ def test_touch_draws_the_dots_at_a_given_displacement_of_the_skin():
             touch(sensor, imprint, shear=jnp.zeros(shape))
 
 
+@pytest.mark.slow
 def test_the_derivative_of_the_image_by_the_tangential_force_equals_finite_differences():
     weights = jnp.asarray(np.random.default_rng(0).normal(size=(32, 32, 3)), jnp.float32)
 

@@ -18,6 +18,7 @@ from golden import make
 EXACT = "STS_JAX_EXACT" in os.environ
 
 
+@pytest.mark.slow
 def test_shipped_models_predict_as_before():
     with np.load(make.HERE / "predictions.npz") as file:
         golden = dict(file)

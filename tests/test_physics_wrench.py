@@ -42,6 +42,7 @@ def moving(cone: str, condim: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
     return model, data
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("cone", "condim"), KINDS)
 def test_all_contacts_of_a_free_body_are_its_constraint_force_in_both_engines(cone, condim):
     model, data = moving(cone, condim)

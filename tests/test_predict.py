@@ -72,6 +72,7 @@ def test_any_subset_and_any_leading_axes(predictor, names):
         np.testing.assert_allclose(alone.visual, out.visual[(0,) * len(lead)], atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["mvae", "statespace"])
 def test_a_prediction_depends_neither_on_its_place_nor_on_the_batch(request, kind):
     predictor = request.getfixturevalue("predictor" if kind == "mvae" else "state_predictor")

@@ -177,6 +177,7 @@ def problems(call):
     return [str(warning.message) for warning in caught], [warning.filename for warning in caught]
 
 
+@pytest.mark.slow
 def test_a_predictor_warns_once_of_each_problem_of_values_that_are_used_and_not_traced(predictor):
     images = seen(predictor, (0.02, 0.03), (-0.02, 0.0), (0.0, 0.0))
     poses = np.array([[0.02, 0.03, 0, 1, 0, 0, 0], [-0.02, 0, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0, 0]], np.float32)

@@ -111,6 +111,7 @@ def recorded() -> tuple[sts.objects.Body, physics.Trajectory]:
     return body, physics.simulate(jax.random.key(0), body, SENSOR, scenario)
 
 
+@pytest.mark.slow
 def test_the_pad_of_simulate_rebuilt_gives_the_recorded_wrench_and_frames(recorded):
     body, trajectory = recorded
     pose, recorded_wrench = (np.asarray(x[0, -1], np.float64) for x in (trajectory.pose, trajectory.wrench))

@@ -317,6 +317,7 @@ def test_views_have_the_weight_of_other_first_moments(loss, complete):
     assert min(each) > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shown", ["object", "nothing"])
 def test_gradient_is_finite_for_an_unknown_rotation(loss, complete, model, empty, shown):
     """No pose counts, and the states of the encoders are zero, so that headings come from vectors of length 0."""
