@@ -102,7 +102,12 @@ def page():
 
 def test_the_page_shows_a_view(page):
     assert b"<title>Collect trajectories</title>" in ask(page, "GET", "/")[1]
-    assert json.loads(ask(page, "GET", "/view")[1]) == {"count": 5, "ended": False, "waiting": True}
+    assert json.loads(ask(page, "GET", "/view")[1]) == {
+        "count": 5,
+        "starting": "connecting",
+        "ended": False,
+        "waiting": True,
+    }
     assert ask(page, "GET", "/end/initial/visual.jpg")[0] == 404
     page.show(view())
     facts = json.loads(ask(page, "GET", "/view")[1])
