@@ -24,6 +24,9 @@ PRESSED = [(at(-0.03, 0, 0.01), weight(1.0, -0.031, 0.001)), (at(0.03, 0.01, 0.0
 TIP = dataclasses.replace(SENSOR, camera=dataclasses.replace(SENSOR.camera, near=0.095))
 
 
+draw = jax.jit(functools.partial(sense, resolution=(24, 24)))
+
+
 def textured(size, seed=0):
     """A plate with a texture that differs in each texel."""
     body = from_trimesh(trimesh.creation.box((0.04, 0.04, 0.01)))
@@ -133,7 +136,6 @@ def test_bodies_of_different_size_classes_and_textures():
     items = [
         (textured(256), at(-0.03, -0.03, 0.03), NOTHING),
         (textured(1), at(0.03, -0.03, 0.03), NOTHING),
-        (textured(1024, 1), at(-0.03, 0.03, 0.03), NOTHING),
         (fine, at(0.04, 0.04, 0.03), NOTHING),
     ]
     assert len({len(body.faces) for body, *_ in items}) == 2
@@ -212,7 +214,6 @@ def test_vmap_equals_a_loop_and_gradients_equal_finite_differences():
                 getattr(frames, field.name)[index], getattr(single, field.name), rtol=1e-4, atol=1e-6
             )
     gradients = jax.grad(lambda *given: total(*given)[0], argnums=(0, 1))(poses, wrenches)
-    loss = jax.jit(lambda *given: total(*given)[0])
     for k, step in ((0, 1e-4), (1, 0.05)):  # m along z, N
         for body in (0, 1):
             given = [poses, wrenches]
@@ -220,14 +221,13 @@ def test_vmap_equals_a_loop_and_gradients_equal_finite_differences():
             for sign in (1, -1):
                 moved = list(given)
                 moved[k] = moved[k].at[body, 2].add(sign * step)
-                ends.append(float(loss(*moved)))
+                ends.append(float(total(*moved)[0]))
             numeric = (ends[0] - ends[1]) / (2 * step)
             assert float(gradients[k][body, 2]) == pytest.approx(numeric, rel=0.05, abs=2e-2)
 
 
 def test_traced_bodies_are_drawn_and_have_gradients():
     poses, wrenches = stacked(*PRESSED)
-    draw = jax.jit(functools.partial(sense, resolution=(24, 24)))
     frame, concrete = (
         draw(SENSOR, [BOX, BALL], poses, wrenches),
         sense(SENSOR, [BOX, BALL], poses, wrenches, resolution=(24, 24)),
@@ -242,9 +242,8 @@ def test_traced_bodies_are_drawn_and_have_gradients():
 
 def test_an_invalid_pose_or_wrench_removes_only_its_body():
     poses, wrenches = stacked(*PRESSED)
-    draw = jax.jit(lambda poses, wrenches: sense(SENSOR, [BOX, BALL], poses, wrenches, resolution=(24, 24)))
     for given in ((poses.at[1, 4].set(jnp.nan), wrenches), (poses, wrenches.at[1, 0].set(jnp.inf))):
-        frame = draw(*given)
+        frame = draw(SENSOR, [BOX, BALL], *given)
         assert frame.balanced.tolist() == [True, False]
         assert set(np.unique(frame.body)) == {-1, 0}
         assert np.isfinite(frame.visual).all()
