@@ -27,7 +27,7 @@ def test_leakage_changes_the_visual_stream_only():
     assert np.abs(found.visual.astype(int) - clean.visual).mean() > 5
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_both_twins_record_the_same_poses_and_the_table_is_written(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(benchmark, "SIZE", SIZE)
     monkeypatch.setattr(benchmark, "DIFFERENCES", benchmark.levels("vignetting", (0.6,)))

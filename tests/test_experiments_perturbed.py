@@ -157,6 +157,7 @@ def tiny_preset(monkeypatch):
     monkeypatch.setitem(EXPERIMENTS, "perturbed", types.SimpleNamespace(PRESETS={"smoke": TINY}))
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("tiny_preset")
 def test_a_scaling_curve_reuses_trained_models(workdir, tmp_path):
     args = scaling.Args(workdir, "perturbed", "smoke", shares=(0.5,), steps=(4,), seeds=(0, 1), out=tmp_path / "a.png")

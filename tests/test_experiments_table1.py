@@ -290,7 +290,7 @@ def test_no_held_out_object_is_in_a_training_or_validation_batch(workdir):
             assert not found & held_out
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command_runs_where_the_first_frame_has_no_touch(tmp_path):
     root = Path(__file__).parents[1]
     words = ["--preset", "smoke", "--scenarios", "freefall", "--models", "mvae", "vae-tactile", "statespace"]
