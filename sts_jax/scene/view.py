@@ -186,7 +186,7 @@ class View:
                     f"data.{name} has the shape {np.shape(getattr(data, name))}, but in the view's model it has "
                     f"{shape}: this is the data of another model, so make a View of that model"
                 )
-        if not is_traced(data.xquat) and not np.any(data.xquat):
+        if not is_traced(data.xquat) and not np.any(np.asarray(data.xquat)):
             raise ValueError("data has no positions yet: call mj_forward (in MJX, mjx.forward) before")
         xmat = jnp.asarray(data.site_xmat, jnp.float32).reshape(-1, 3, 3)
         arrays = {name: jnp.asarray(getattr(data, name), jnp.float32) for name in self._shapes}
