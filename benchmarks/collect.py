@@ -1,6 +1,6 @@
 """Speed, memory and size of collected datasets, of reading them, and of training from the disk.
 
-    python -m benchmarks.collect --out benchmarks/results/collect/collect.md    # 1.5 to 2 hours on two CPU cores
+    python -m benchmarks.collect --out benchmarks/results/collect/collect.md    # 15 minutes to an hour on two CPU cores
     python -m benchmarks.collect --preset smoke --scenarios freefall --steps 4  # minutes, for a first look
 
 1. The stages of one shard: objects, physics, rendering and writing, each in this process with its peak memory.
@@ -34,7 +34,7 @@ from sts_jax.dataset import records, shards
 from sts_jax.dataset.rendering import render
 
 MILLIONS = 10_000_000  # trajectories of the last table
-BATCH = 64  # random frames of one read
+BATCHES = (64, 1024)  # numbers of random frames of one read
 READ_S = 10.0  # duration of the random reads
 CARD_LINES = 45  # first lines of each data card that are shown
 
@@ -136,15 +136,15 @@ def whole(args: Args, scenario: str) -> Whole:
     return Whole(*storage.read_json(note, f"delete {note}"))
 
 
-def reading(data: dataset.Dataset) -> float:
+def reading(data: dataset.Dataset, batch: int) -> float:
     """Random stored frames (both images and the segmentation) that are read per second."""
     draw = np.random.default_rng(0)
     opened: dict[int, records.Shard] = {}
-    data.images(draw.integers(len(data.frames), size=BATCH), opened=opened)
+    data.images(draw.integers(len(data.frames), size=batch), opened=opened)
     begin, count = time.perf_counter(), 0
     while time.perf_counter() - begin < READ_S:
-        data.images(draw.integers(len(data.frames), size=BATCH), opened=opened)
-        count += BATCH
+        data.images(draw.integers(len(data.frames), size=batch), opened=opened)
+        count += batch
     return count / (time.perf_counter() - begin)
 
 
@@ -212,7 +212,7 @@ def main(args: Args) -> str:
         "",
         "| reading and training | |",
         "|---|---|",
-        f"| random frames per second, {first}, batches of {BATCH} | {reading(opened[first]):,.0f} |",
+        *(f"| random frames/s, {first}, batches of {n:,} | {reading(opened[first], n):,.0f} |" for n in BATCHES),
         f"| epoch from the disk (s) | {disk:,.0f} |",
         f"| epoch from memory (s) | {memory:,.0f} |",
         f"| ratio | {disk / memory:.2f} |",

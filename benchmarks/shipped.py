@@ -39,6 +39,7 @@ COLUMNS = {
 SAMPLE_COLUMNS = {  # columns of the table of the samples
     f"visual skill, best of {NUM_SAMPLES}": "visual_skill_best",
     "sharpness": "sharpness",
+    "tactile sharpness": "tactile_sharpness",
     "energy score (mm)": "energy",
     f"coverage of {100 * evaluation.metrics.LEVEL:g} %": "coverage",
 }

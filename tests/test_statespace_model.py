@@ -207,6 +207,12 @@ def test_share_of_levels_that_cover_a_pixel_is_its_probability():
     assert np.mean((sharp["visual"] < 0.05) | (sharp["visual"] > 0.95)) > 0.7
     for images in (soft, sharp):
         np.testing.assert_allclose(images["tactile"], 0.4, rtol=1e-5)
+    lit = drawn._replace(touch=jnp.full((200, 5, 5, 3), 40.0), pressed=logit)  # an imprint is white
+    soft_touch, sharp_touch = (
+        networks.compose(lit, empty, level)["tactile"] for level in (None, (jnp.arange(200) + 0.5) / 200)
+    )
+    np.testing.assert_allclose(soft_touch, 0.4 + 0.6 * soft["visual"], atol=1e-5)
+    np.testing.assert_allclose(sharp_touch, 0.4 + 0.6 * sharp["visual"], atol=1e-5)
     level, contrast = jnp.full(200, 0.3), jnp.linspace(1, 9, 200)
     softer = networks.compose(drawn, empty, level, contrast)["visual"]
     odds = (chance / (1 - chance) / (0.3 / 0.7))[0, None] ** np.asarray(contrast)[:, None, None, None]

@@ -99,16 +99,18 @@ def _best_errors(predicted: Predicted, test: Pairs) -> np.ndarray | None:
     return errors[errors[..., 1].argmin(0), np.arange(len(truth))]
 
 
-def _gradients(predicted: Predicted, test: Pairs) -> np.ndarray | None:
-    """Gradient energy of the visual image (mean over the samples), and of the true one."""
-    samples = None if predicted.samples is None else predicted.samples.visual
-    if samples is not None:
-        energy = np.mean([metrics.gradient_energy(in_unit(image)) for image in samples], axis=0)
-    elif predicted.visual is not None:
-        energy = metrics.gradient_energy(in_unit(predicted.visual))
-    else:
-        return None
-    return np.stack([energy, metrics.gradient_energy(test.visual[:, 1] / 255)], 1)
+def _gradients(stream: str) -> Callable[[Predicted, Pairs], np.ndarray | None]:
+    """Gradient energy of the image of a stream (mean over the samples), and of the true one."""
+
+    def energies(predicted: Predicted, test: Pairs) -> np.ndarray | None:
+        samples = None if predicted.samples is None else getattr(predicted.samples, stream)
+        images = [getattr(predicted, stream)] if samples is None else samples
+        if images[0] is None:
+            return None
+        energy = np.mean([metrics.gradient_energy(in_unit(image)) for image in images], axis=0)
+        return np.stack([energy, metrics.gradient_energy(getattr(test, stream)[:, 1] / 255)], 1)
+
+    return energies
 
 
 def _of_pose(
@@ -202,6 +204,17 @@ def _image_metrics(stream: str) -> tuple[Metric, ...]:
     )
 
 
+def _sharpness(stream: str, name: str, note: str = "") -> Metric:
+    return Metric(
+        name,
+        _gradients(stream),
+        digits=2,
+        reduce=lambda gradients, weight: metrics.ratio(gradients[:, 0], gradients[:, 1], weight),
+        interval=False,
+        note=note,
+    )
+
+
 _position, _angle, _axis = (
     _of_pose(function) for function in (metrics.position_error, metrics.geodesic_angle, metrics.axis_angle)
 )
@@ -221,16 +234,14 @@ METRICS: tuple[Metric, ...] = (
         note="The best sample of a trajectory is the one with the smallest visual excess. This choice uses the true "
         "image.",
     ),
-    Metric(
+    _sharpness(
+        "visual",
         "sharpness",
-        _gradients,
-        digits=2,
-        reduce=lambda gradients, weight: metrics.ratio(gradients[:, 0], gradients[:, 1], weight),
-        interval=False,
-        note="Sharpness is the gradient energy of the visual samples divided by that of the true images. Gradient "
-        "energy is the sum of the squared differences of neighbouring pixels.",
+        note="Sharpness is the gradient energy of the samples divided by that of the true images, of the visual ones "
+        "unless it is named otherwise. Gradient energy is the sum of the squared differences of neighbouring pixels.",
     ),
     *_image_metrics("tactile"),
+    _sharpness("tactile", "tactile_sharpness"),
     _millimetres("position", _position, interval=False),
     _millimetres("position_median", _position, heading="position, median", reduce=metrics.median, interval=False),
     _millimetres(

@@ -2,7 +2,7 @@
 
 XLA's CPU backend is slow for convolutions with `lhs_dilation`, which JAX uses for transposed convolutions and for the
 gradients of strided convolutions. The functions below use matrix products and convolutions without dilation instead.
-For small images and stride 1, a Fourier transform also saves most of the multiplications.
+For small images, stride 1 and kernels above 3x3, a Fourier transform also saves most of the multiplications.
 
 Images have shape `(batch, height, width, channel)`. Kernels have shape `(size, size, in, out)`, and `size` must be a
 multiple of `stride`.
@@ -18,6 +18,9 @@ from jaxtyping import Array, Float
 _LAYOUT = ("NHWC", "HWIO", "NHWC")
 _FEW = 16  # channels. For fewer, `_convolve` is faster with folded pixels, and `_correlate` with a single convolution
 _SMALL = 144  # pixels of the larger image with its padding. Up to this size, a dense Fourier transform is faster
+_SUMMED = (
+    2048  # pixels. `_correlate` adds products that are sums over about as many pixels: longer sums leave the cache
+)
 
 
 def conv(
@@ -33,7 +36,7 @@ def conv(
         padding: Number of zeros before the first and after the last pixel of each axis, at most `size - 1`.
     """
     height, width = (n + 2 * padding - len(kernel) + 1 for n in x.shape[1:3])
-    if stride == 1 and (height + len(kernel) - 1) * (width + len(kernel) - 1) <= _SMALL:
+    if stride == 1 and len(kernel) > 3 and (height + len(kernel) - 1) * (width + len(kernel) - 1) <= _SMALL:
         narrow, taps, wide = _fourier(height, width, len(kernel), padding)
         return _bilinear(x, kernel, wide, taps, narrow).reshape(len(x), height, width, -1)
     return _conv(x, kernel, stride, padding)
@@ -52,7 +55,7 @@ def conv_transpose(
         padding: Number of rows and columns that are cut from each side of the output.
     """
     height, width = (stride * (n - 1) + len(kernel) - 2 * padding for n in x.shape[1:3])
-    if stride == 1 and (height + 2 * padding) * (width + 2 * padding) <= _SMALL:
+    if stride == 1 and len(kernel) > 3 and (height + 2 * padding) * (width + 2 * padding) <= _SMALL:
         narrow, taps, wide = _fourier(*x.shape[1:3], len(kernel), padding)
         return _bilinear(x, kernel, narrow, taps, wide).reshape(len(x), height, width, -1)
     return _conv_transpose(x, kernel, stride, padding)
@@ -152,7 +155,9 @@ def _correlate(wide: Array, narrow: Array, size: int, stride: int, padding: int)
     wide = _cut(wide, -padding, h + size - 1, w + size - 1)
     if size > 2 or wide.shape[3] < _FEW:
         sums = ("CHWN", "IHWO", "HWNC")  # the batch is in the place of the channels, because the sum is over the batch
-        return jax.lax.conv_general_dilated(wide, narrow, (1, 1), "VALID", dimension_numbers=sums)
+        some = -(-_SUMMED // (h * w))
+        parts = [(wide[i : i + some], narrow[i : i + some]) for i in range(0, len(narrow), some)]
+        return sum(jax.lax.conv_general_dilated(*part, (1, 1), "VALID", dimension_numbers=sums) for part in parts)
     flat = narrow.reshape(-1, channels)
     taps = [wide[:, a : a + h, b : b + w].reshape(len(flat), -1) for a in range(size) for b in range(size)]
     products = [jax.lax.dot_general(flat, tap, (((0,), (0,)), ((), ()))) for tap in taps]

@@ -17,7 +17,7 @@ class LossWeights:
     state: float = 16.0  # squared error of each encoder's state code
     pose: float = 4.0  # negative log likelihoods of the final pose (or of a step) and of the encoders' estimates
     outcome: float = 8.0  # negative log likelihood of the outcome
-    covered: float = 0.15  # cross-entropy of the object's outline
+    covered: float = 0.15  # cross-entropy of the outlines of the object and, with `Config.imprints`, of its imprint
     first: float = 0.5  # errors of the images of the first frame
     look: float = 0.1  # divergence of the appearance code. Below 1, samples are sharper
 
@@ -49,6 +49,9 @@ class Config:
     canvas: int = 64  # pixels, side of the canvas: the image of an object before it is placed in the view
     canvas_side: float = 0.165  # m, side of the square parallel to the pad that the canvas covers
     weights: LossWeights = LossWeights()  # of the terms of the loss
+    # True: the decoder predicts the outline of the imprint in the tactile image, so that samples have sharp imprints.
+    # False: it predicts only a mean tactile image, as in the models that come with the library
+    imprints: bool = False
     drawn: float = 0.4375  # share of a batch with a rendered last frame (the whole batch trains the other parts)
     drawn_first: float = 0.125  # share of a batch with a rendered first frame
     vectors: int = 1  # number of vectors (x, y) in the plane of the pad with which the condition begins

@@ -7,7 +7,8 @@
 - `visual` and `tactile`: the cross-entropy of the rendered images of the last frame, minus the entropy of the targets.
   `visual` is a sum over the pixels that show the object. `tactile` is a sum over all pixels
 - `first`: the sum of the terms `visual` and `tactile`, but computed for the input images of the first frame
-- `covered`: the cross-entropy of the probability that a pixel shows the object, for both frames
+- `covered`: the cross-entropy of the probability that a pixel shows the object, for both frames, and with
+  `Config.imprints` that of the probability that a pixel of the tactile image shows an imprint
 - `look`: the divergence of the appearance code from its prior, multiplied by `beta` in the loss
 
 The decoder renders the object in its true pose in each of the two frames. It therefore never learns a mean of images
@@ -419,16 +420,21 @@ def _picture_terms(
         "covered": jnp.mean(_outline_nats(layers.covered[:number], seen)),
         "first": jnp.zeros(()),
     }
+    if layers.pressed is not None:
+        imprint = window.shows(after.images["tactile"] - small["tactile"])
+        terms["covered"] += jnp.mean(_outline_nats(layers.pressed[:number], imprint))
     for name, image in before.images.items():
         counts = before.counts[name]
         target = reduced(counted(counts, image), size)
         share = counts / jnp.maximum(jnp.sum(counts), 1)
+        seen = window.shows(target - small[name])
         if name == "visual":
-            seen = window.shows(target - small[name])
             terms["covered"] += jnp.sum(share * _outline_nats(layers.covered[number:], seen))
             terms["first"] += jnp.sum(share * excess(layers.colour[number:], target, seen))
         else:
             terms["first"] += jnp.sum(share * excess(touch[number:], target))
+            if layers.pressed is not None:
+                terms["covered"] += jnp.sum(share * _outline_nats(layers.pressed[number:], seen))
     return terms
 
 

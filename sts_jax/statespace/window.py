@@ -39,24 +39,26 @@ def locate(change: Float[Array, "n size size 3"]) -> Window:
     """
     size = change.shape[1]
     weight = shows(change)
-    seen = weight > 0
     total = jnp.maximum(jnp.sum(weight, axis=(1, 2)), 1)
-    place = (jnp.arange(size) + 0.5) / size
-
-    def mean(x: Float[Array, "n size size"]) -> Float[Array, "n"]:
-        return jnp.sum(weight * x, axis=(1, 2)) / total
-
-    column, row = jnp.broadcast_to(place, weight.shape), jnp.broadcast_to(place[:, None], weight.shape)
-    middle = jnp.stack([mean(column), mean(row)], axis=-1)
-    x, y = column - middle[:, :1, None], row - middle[:, 1:, None]
-    twice = jnp.stack([mean(x * x) - mean(y * y), 2 * mean(x * y)], axis=-1)
-    half = jnp.arctan2(twice[:, 1], twice[:, 0]) / 2
+    place = (jnp.arange(size) + 0.5) / size - 0.5  # from the centre of the image
+    of_columns, of_rows = jnp.sum(weight, axis=1) / total[:, None], jnp.sum(weight, axis=2) / total[:, None]
+    middle = jnp.stack([of_columns @ place, of_rows @ place], axis=-1)
+    x, y = place - middle[:, :1], place - middle[:, 1:]  # of each column and of each row
+    mixed = jnp.sum(y * (weight @ place), axis=-1) / total
+    square = jnp.sum(of_columns * x**2, axis=-1) - jnp.sum(of_rows * y**2, axis=-1)
+    half = jnp.arctan2(2 * mixed, square) / 2
     angle = jnp.stack([jnp.cos(half), jnp.sin(half)], axis=-1)
-    turned = poses.turn_back(angle[:, None, None], jnp.stack([x, y], axis=-1))
-    low = jnp.min(jnp.where(seen[..., None], turned, jnp.inf), axis=(1, 2))
-    high = jnp.max(jnp.where(seen[..., None], turned, -jnp.inf), axis=(1, 2))
+    # The first and the last pixel of each row include the extreme ones along any axis.
+    seen, columns = weight > 0, x[:, None]
+    in_row = jnp.any(seen, axis=2)[..., None, None]
+    first = jnp.min(jnp.where(seen, columns, jnp.inf), axis=2)
+    last = jnp.max(jnp.where(seen, columns, -jnp.inf), axis=2)
+    ends = jnp.stack([jnp.stack([first, y], axis=-1), jnp.stack([last, y], axis=-1)], axis=2)
+    turned = poses.turn_back(angle[:, None, None], jnp.where(in_row, ends, 0))
+    low = jnp.min(jnp.where(in_row, turned, jnp.inf), axis=(1, 2))
+    high = jnp.max(jnp.where(in_row, turned, -jnp.inf), axis=(1, 2))
     side = jnp.maximum(jnp.max(high - low, axis=-1) * MARGIN + 1 / size, SMALLEST)
-    centre = middle + poses.turn(angle, (low + high) / 2)
+    centre = 0.5 + middle + poses.turn(angle, (low + high) / 2)
     visible = jnp.any(seen, axis=(1, 2))
     return Window(
         jnp.where(visible[:, None], centre, 0.5),

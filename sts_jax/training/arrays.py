@@ -530,6 +530,7 @@ def state_model(
         vectors=scenario.vectors if scenario.quantities else 1,
         input_size=height,
         image_size=image_size,
+        imprints=True,
         camera_distance=float(sensor.camera.distance),
         view=float(optics.full_window(sensor.camera, preprocessing.resolution)[2]),
         position_scale=preprocessing.position_scale,
