@@ -128,8 +128,8 @@ def test_a_state_space_model_with_views_and_falls_trains_as_on_one_device(tmp_pa
     one, two = (np.concatenate([np.ravel(leaf) for leaf in weights(tmp_path / name)]) for name in ("one", "two"))
     # Adam makes a step of full length from a gradient that is rounding alone. How many weights have one depends on the
     # processor.
-    assert np.median(np.abs(one - two)) < 2e-6
-    assert np.quantile(np.abs(one - two), 0.99) < 1e-4
+    assert np.median(np.abs(one - two)) < 2e-5
+    assert np.quantile(np.abs(one - two), 0.99) < 5e-4
     assert_same_losses(tmp_path / "two", tmp_path / "one", rel=1e-3)
 
 
