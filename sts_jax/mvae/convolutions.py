@@ -157,7 +157,8 @@ def _correlate(wide: Array, narrow: Array, size: int, stride: int, padding: int)
         sums = ("CHWN", "IHWO", "HWNC")  # the batch is in the place of the channels, because the sum is over the batch
         some = -(-_SUMMED // (h * w))
         parts = [(wide[i : i + some], narrow[i : i + some]) for i in range(0, len(narrow), some)]
-        return sum(jax.lax.conv_general_dilated(*part, (1, 1), "VALID", dimension_numbers=sums) for part in parts)
+        products = [jax.lax.conv_general_dilated(*part, (1, 1), "VALID", dimension_numbers=sums) for part in parts]
+        return functools.reduce(jnp.add, products)
     flat = narrow.reshape(-1, channels)
     taps = [wide[:, a : a + h, b : b + w].reshape(len(flat), -1) for a in range(size) for b in range(size)]
     products = [jax.lax.dot_general(flat, tap, (((0,), (0,)), ((), ()))) for tap in taps]
