@@ -35,9 +35,10 @@ def test_a_small_run_prints_the_metrics_of_every_input(tmp_path):
     assert {path.name for path in tmp_path.glob("*.png")} == {"work-visual.png", "work-all.png"}
     samples = text.split("# released: 16 samples of each prediction")[1]
     row = next(line for line in samples.splitlines() if line.startswith("| from all inputs |"))
-    best, sharpness, energy, coverage = (float(cell.split()[0]) for cell in row.split("|")[2:-1])
+    best, sharpness, touch_sharpness, energy, coverage = (float(cell.split()[0]) for cell in row.split("|")[2:-1])
     assert best > 0.4
     assert 0.5 < sharpness < 1.5
+    assert 0.05 < touch_sharpness < sharpness
     assert 0 < energy < 100
     assert 0 < coverage <= 1
     assert shipped.main(args) == text  # the trajectories are reused
