@@ -122,6 +122,9 @@ def test_a_distribution_is_scored_by_its_samples_and_probabilities():
     assert (scores["visual_skill_best"] > scores["visual_skill"])[:, 1].any()  # a mean may be better than each sample
     sharp = np.mean([metrics.gradient_energy(image / 255) for image in predicted.samples.visual], 0)
     np.testing.assert_allclose(scores["sharpness"].T, [sharp, metrics.gradient_energy(truth)], rtol=1e-5)
+    felt = np.mean([metrics.gradient_energy(image / 255) for image in predicted.samples.tactile], 0)
+    true = metrics.gradient_energy(test.tactile[:, 1] / 255)
+    np.testing.assert_allclose(scores["tactile_sharpness"].T, [felt, true], rtol=1e-5)
     rests = predicted.outcome_probability[:, 0]  # Freefall.outcomes: rests, fell off
     happened = np.where(test.outcome == RESTS, rests, 1 - rests)
     np.testing.assert_allclose(scores["outcome_log_loss"], -np.log(np.maximum(happened, 1e-3)))

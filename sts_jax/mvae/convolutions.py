@@ -18,9 +18,7 @@ from jaxtyping import Array, Float
 _LAYOUT = ("NHWC", "HWIO", "NHWC")
 _FEW = 16  # channels. For fewer, `_convolve` is faster with folded pixels, and `_correlate` with a single convolution
 _SMALL = 144  # pixels of the larger image with its padding. Up to this size, a dense Fourier transform is faster
-_SUMMED = (
-    2048  # pixels. `_correlate` adds products that are sums over about as many pixels: longer sums leave the cache
-)
+_SUMMED = 2048  # pixels. `_correlate` sums over about as many at once: longer sums do not fit the cache
 
 
 def conv(
