@@ -163,6 +163,28 @@ def test_trajectories_do_not_depend_on_number_chunk_threads_and_progress_bar(dro
         np.testing.assert_array_equal(getattr(again, name), getattr(drops, name)[[0, 1, 2, 6, 7, 8]])
 
 
+@pytest.mark.parametrize("scenario", [Freefall(), Perturbed(), Released(), Inclined()])
+def test_reflected_starts_have_reflected_ends(scenario):
+    assert scenario.symmetric
+    bottle = objects.make(jax.random.key(3), "bottle")  # its own reflection
+    sides = np.array([-1, 1, 1], np.float32)
+
+    def reflected(pose):
+        turned = Rotation.from_quat(pose[..., 3:].reshape(-1, 4), scalar_first=True).as_matrix()
+        quat = Rotation.from_matrix(sides[:, None] * turned * sides).as_quat(scalar_first=True)
+        return np.concatenate([pose[..., :3] * sides, quat.reshape(*pose.shape[:-1], 4)], axis=-1).astype(np.float32)
+
+    found = simulate(jax.random.key(1), bottle, scenario=scenario, num=12)
+    force = np.concatenate([sides[:2], [1]])[: found.condition.shape[1]]
+    held = jnp.asarray(0 if scenario.quantities else scenario.steps)
+    start = physics.Start(reflected(np.asarray(found.pose[:, 0])), held, found.condition * force)
+    hidden = found.hidden._replace(up=found.hidden.up * sides)
+    other = simulate(jax.random.key(2), bottle, scenario=scenario, num=12, start=start, hidden=hidden)
+    apart = np.linalg.norm(other.pose[..., :3] - reflected(np.asarray(found.pose))[..., :3], axis=-1)
+    assert np.median(apart[:, -1]) < 0.001  # m
+    assert np.linalg.norm(found.pose[:, -1, :2] - found.pose[:, 0, :2], axis=-1).max() > 0.005
+
+
 def test_given_starts_and_hidden_values_replace_the_draws_and_nothing_is_printed_by_default(capsys):
     drops = dropped("mujoco")
     hidden, pose = jax.tree.map(lambda x: x[:NUM], drops.hidden), drops.pose[:NUM]

@@ -356,6 +356,26 @@ def test_beliefs_of_falls_are_exact_or_have_noise_of_their_variance():
     assert np.sqrt(noise).max() < 1.01
 
 
+def test_half_of_the_trajectories_are_reflected_with_their_turns_and_jerks(batch):
+    number = len(batch["targets"]["state"])
+    code, pose = jnp.asarray(batch["targets"]["state"]), jnp.asarray(batch["targets"]["pose"])
+    belief = Gaussian(code + 1, jnp.zeros_like(code))
+    before = objective._Ends(belief, code, pose, jnp.arange(number), jnp.asarray(batch["condition"]), jnp.ones(number))
+    after = objective._reflected(jax.random.key(0), STATE, before)
+    chosen = np.asarray(after.pose[:, 0] != before.pose[:, 0])
+    assert 0 < chosen.sum() < number
+    turns = [objective.rotation_between(x.state, x.pose) for x in (before, after)]
+    sides = np.array([-1.0, 1, 1])
+    expected = np.where(chosen[:, None, None], sides[:, None] * turns[0] * sides, turns[0])
+    np.testing.assert_allclose(turns[1], expected, atol=1e-5)
+    jerks = np.where(chosen[:, None], batch["condition"] * sides, batch["condition"])
+    np.testing.assert_array_equal(after.condition, jerks)
+    np.testing.assert_allclose(
+        after.belief.mean - after.state, np.where(chosen[:, None], state.REFLECTED, 1), atol=1e-5
+    )
+    same((after.outcome, after.counts, after.belief.log_var), (before.outcome, before.counts, belief.log_var))
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

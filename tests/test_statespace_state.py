@@ -99,6 +99,17 @@ def test_turned_state_is_the_state_of_the_turned_pose():
     np.testing.assert_allclose(poses.turn_code_back(unit(ANGLES), after.pose), before.pose, atol=1e-5)
 
 
+def test_reflected_state_is_the_state_of_the_reflected_object():
+    rotations, place = Rotation.random(NUMBER, random_state=4), np.array([0.3, -0.2, 0.5])
+    points, com = 0.02 * np.random.default_rng(0).normal(size=(30, 3)), np.array([0.004, -0.002, 0.007])
+    across = np.array([-1.0, 1, 1])
+    other = Rotation.from_matrix(across[:, None] * rotations.as_matrix() * across)
+    expected = encoded(other, points * across, com * across, place * across)
+    found = encoded(rotations, points, com, place) * state.REFLECTED
+    np.testing.assert_allclose(found, expected, atol=0.03)  # the directions of a fit are not symmetric
+    assert np.abs(found - encoded(rotations, points, com, place)).max() > 0.3
+
+
 def test_turned_variance_is_the_diagonal_of_the_turned_covariance():
     variance = np.random.default_rng(0).uniform(0.1, 2, state.CODE).astype(np.float32)
     angle = unit([0.7])

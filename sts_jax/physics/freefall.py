@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -36,6 +37,7 @@ class Freefall(Scenario):
     # contact and solver constants (the gel brakes rolling objects, so that round objects come to rest, and time steps
     # below the default do not change falls)
     contact: Contact = dataclasses.field(default_factory=lambda: Contact(0.001, width=0.00005, rolling=0.002))
+    symmetric: ClassVar[bool] = True
 
     def check(self) -> None:
         """See `Scenario.check`."""

@@ -65,6 +65,7 @@ class Inclined(Scenario):
     # largest angle between the object's +z and the upward direction in which its contents settled (rad)
     tilt: float = math.pi
     contact: Contact = dataclasses.field(default_factory=Contact)  # contact and solver constants
+    symmetric: ClassVar[bool] = True
     by_contents: ClassVar[bool] = True
 
     def check(self) -> None:

@@ -67,6 +67,7 @@ class Perturbed(Scenario):
     # largest angle between the object's +z and the upward direction in which its contents settled (rad)
     tilt: float = 0.0
     contact: Contact = dataclasses.field(default_factory=Contact)  # contact and solver constants
+    symmetric: ClassVar[bool] = True
     must_stand: ClassVar[bool] = True
 
     def check(self) -> None:

@@ -71,6 +71,7 @@ class Released(Scenario):
     # contact and solver constants (a gel brakes rolling objects, but more rolling friction would let an object stand on
     # its edge)
     contact: Contact = dataclasses.field(default_factory=lambda: Contact(rolling=0.0005))
+    symmetric: ClassVar[bool] = True
     by_contents: ClassVar[bool] = True
 
     def check(self) -> None:

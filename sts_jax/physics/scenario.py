@@ -111,6 +111,7 @@ class Scenario(abc.ABC):
     # quantities of the condition, vectors first
     quantities: ClassVar[tuple[Quantity, ...]] = ()
     must_stand: ClassVar[bool] = False  # True if the scenario refuses objects that cannot stand with +z up
+    symmetric: ClassVar[bool] = False  # True if neither side of x = 0 is preferred
     by_contents: ClassVar[bool] = False  # True if `Shape.coms` must have centres of mass for random contents
 
     rate: float = 31.25  # frame rate (frames/s)

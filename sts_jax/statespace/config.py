@@ -52,6 +52,9 @@ class Config:
     # True: the decoder predicts the outline of the imprint in the tactile image, so that samples have sharp imprints.
     # False: it predicts only a mean tactile image, as in the models that come with the library
     imprints: bool = False
+    # True: in the training of the transition, every second trajectory is reflected (x -> -x). This is right if the
+    # scenario has no preferred side
+    reflected: bool = False
     drawn: float = 0.4375  # share of a batch with a rendered last frame (the whole batch trains the other parts)
     drawn_first: float = 0.125  # share of a batch with a rendered first frame
     vectors: int = 1  # number of vectors (x, y) in the plane of the pad with which the condition begins

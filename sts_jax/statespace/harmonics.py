@@ -60,6 +60,12 @@ def values(
     return jnp.einsum("nck,njk->ncj", coefficients, basis(jnp.asarray(directions) @ rotation, degree))
 
 
+def reflected(count: int) -> Float[np.ndarray, "k"]:
+    """Factors of k coefficients under the reflection x -> -x."""
+    orders = np.array([m for _, m in _orders(math.isqrt(count) - 1)])
+    return np.where((orders + (orders < 0)) % 2, -1, 1).astype(np.float32)
+
+
 def turn(angle: Float[Array, "n 2"], coefficients: Float[Array, "n c k"]) -> Float[Array, "n c k"]:
     """Rotate functions about the z axis. `angle` has the cosine and the sine of each rotation angle."""
     cosine, sine, partner = _about_vertical(angle, coefficients.shape[-1])

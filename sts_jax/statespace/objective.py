@@ -17,7 +17,8 @@ least one image.
 
 Views contribute to `state` and `doubt`. In `first` and `covered`, they replace the first frames of the trajectories.
 Falls contribute to `outcome` and `pose`. The belief of a fall is made from the true state. In every second fall, noise
-is added to the shape and the mass.
+is added to the shape and the mass. With `Config.reflected`, a random half of all trajectories, with or without images,
+is reflected before the transition.
 
 In a one-step model, `pose` is the NLL of the motion over one step from a random frame of each trajectory or fall. The
 belief about the first frame is moved along the true course to this frame, as a roll-out moves it along a predicted
@@ -205,6 +206,8 @@ def loss(
     if falls is not None:
         ends.append(_known_ends(blur, falls, end))
     every = jax.tree.map(lambda *x: jnp.concatenate(x), *ends)
+    if config.reflected:
+        every = _reflected(jax.random.fold_in(key, 1), config, every)
     terms |= _step_terms(model, jax.random.fold_in(key, 0), every) if config.stride else _end_terms(model, every)
 
     belief = _drawn_belief(choice, images, members, beliefs)
@@ -328,6 +331,22 @@ def _known_ends(key: PRNGKeyArray, falls: dict[str, Array], end: str = "pose") -
     known = jnp.ones(number, bool)
     belief = fuse({"state": Gaussian(mean, 2 * doubt)}, {"state": known})
     return _Ends(belief, code, falls[end], falls["outcome"], falls.get("condition"), known)
+
+
+def _reflected(key: PRNGKeyArray, config: Config, ends: _Ends) -> _Ends:
+    """Reflect (x -> -x) a random half of the trajectories, with their objects."""
+    chosen = jax.random.bernoulli(key, shape=(len(ends.state), 1))
+    force = np.concatenate([np.tile(poses.SIDES[:2], config.vectors), np.ones(config.condition)])[: config.condition]
+
+    def of(values: Array, factors: np.ndarray) -> Array:
+        return values * jnp.where(chosen.reshape(-1, *(1,) * (values.ndim - 1)), factors, 1)
+
+    return ends._replace(
+        belief=ends.belief._replace(mean=of(ends.belief.mean, state.REFLECTED)),
+        state=of(ends.state, state.REFLECTED),
+        pose=of(ends.pose, poses.REFLECTED),
+        condition=None if ends.condition is None else of(ends.condition, force),
+    )
 
 
 def _end_terms(model: Model, ends: _Ends) -> dict[str, Float[Array, ""]]:

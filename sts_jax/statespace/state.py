@@ -26,6 +26,9 @@ MEAN = 3.0  # subtracted from support functions, in units of LENGTH
 MASS = 0.05  # kg, unit of the mass
 SIZES = (poses.CODE, SUPPORT, 3, 1, SUPPORT, 3)  # numbers of each part
 CODE = sum(SIZES)  # numbers in a state code
+_FORM = harmonics.reflected(SUPPORT), poses.SIDES
+# Factors of the numbers of a state code under the reflection x -> -x of the whole scene, the object included
+REFLECTED = np.concatenate([poses.REFLECTED, *_FORM, np.ones(1, np.float32), *_FORM])
 
 
 class State(NamedTuple):
