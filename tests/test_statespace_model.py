@@ -371,7 +371,7 @@ def test_half_of_the_trajectories_are_reflected_with_their_turns_and_jerks(batch
     jerks = np.where(chosen[:, None], batch["condition"] * sides, batch["condition"])
     np.testing.assert_array_equal(after.condition, jerks)
     np.testing.assert_allclose(
-        after.belief.mean - after.state, np.where(chosen[:, None], state.REFLECTED, 1), atol=1e-5
+        after.belief.mean - after.state, np.where(chosen[:, None], state.reflection(code), 1), atol=1e-5
     )
     same((after.outcome, after.counts, after.belief.log_var), (before.outcome, before.counts, belief.log_var))
 

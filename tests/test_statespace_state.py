@@ -99,13 +99,17 @@ def test_turned_state_is_the_state_of_the_turned_pose():
     np.testing.assert_allclose(poses.turn_code_back(unit(ANGLES), after.pose), before.pose, atol=1e-5)
 
 
-def test_reflected_state_is_the_state_of_the_reflected_object():
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_reflected_state_is_the_state_of_the_reflected_object(axis):
     rotations, place = Rotation.random(NUMBER, random_state=4), np.array([0.3, -0.2, 0.5])
     points, com = 0.02 * np.random.default_rng(0).normal(size=(30, 3)), np.array([0.004, -0.002, 0.007])
+    own = np.where(np.arange(3) == axis, -1.0, 1.0)
+    points = np.concatenate([points, points * own + [0.002, 0.001, 0]])  # almost symmetric across this plane alone
     across = np.array([-1.0, 1, 1])
-    other = Rotation.from_matrix(across[:, None] * rotations.as_matrix() * across)
-    expected = encoded(other, points * across, com * across, place * across)
-    found = encoded(rotations, points, com, place) * state.REFLECTED
+    other = Rotation.from_matrix(across[:, None] * rotations.as_matrix() * own)
+    expected = encoded(other, points * own, com * own, place * across)
+    code = encoded(rotations, points, com, place)
+    found = code * state.reflection(code)
     np.testing.assert_allclose(found, expected, atol=0.03)  # the directions of a fit are not symmetric
     assert np.abs(found - encoded(rotations, points, com, place)).max() > 0.3
 

@@ -42,7 +42,7 @@ class Config:
     support: int = 64  # number of directions at which transition and decoder see the support functions
     components: int = 6  # Gaussians in the density of the final pose for each outcome, or of one step
     window: int = 32  # pixels, side of the magnified window around the object that an encoder sees
-    encoder: tuple[int, ...] = (64, 128, 128)  # channels at 1/2, 1/4 and 1/8 of the window's resolution
+    encoder: tuple[int, ...] = (24, 64, 128)  # channels at 1/2, 1/4 and 1/8 of the window's resolution
     decoder: tuple[int, ...] = (128, 64, 32)  # channels at 1/8, 1/4 and 1/2 of the canvas's resolution
     hidden: int = 384  # width of the encoders' fully connected layers
     transition: int = 512  # width of the transition's layers

@@ -60,10 +60,10 @@ def values(
     return jnp.einsum("nck,njk->ncj", coefficients, basis(jnp.asarray(directions) @ rotation, degree))
 
 
-def reflected(count: int) -> Float[np.ndarray, "k"]:
-    """Factors of k coefficients under the reflection x -> -x."""
-    orders = np.array([m for _, m in _orders(math.isqrt(count) - 1)])
-    return np.where((orders + (orders < 0)) % 2, -1, 1).astype(np.float32)
+def reflected(count: int) -> Float[np.ndarray, "3 k"]:
+    """Factors of k coefficients under the reflections x -> -x, y -> -y and z -> -z."""
+    n, m = np.array(_orders(math.isqrt(count) - 1)).T
+    return np.where(np.stack([(m + (m < 0)) % 2, m < 0, (n + m) % 2]), -1, 1).astype(np.float32)
 
 
 def turn(angle: Float[Array, "n 2"], coefficients: Float[Array, "n c k"]) -> Float[Array, "n c k"]:

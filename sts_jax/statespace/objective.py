@@ -336,16 +336,17 @@ def _known_ends(key: PRNGKeyArray, falls: dict[str, Array], end: str = "pose") -
 def _reflected(key: PRNGKeyArray, config: Config, ends: _Ends) -> _Ends:
     """Reflect (x -> -x) a random half of the trajectories, with their objects."""
     chosen = jax.random.bernoulli(key, shape=(len(ends.state), 1))
-    force = np.concatenate([np.tile(poses.SIDES[:2], config.vectors), np.ones(config.condition)])[: config.condition]
+    factors = jnp.where(chosen, state.reflection(ends.state), 1)
+    vectors = np.concatenate([np.tile([-1, 1], config.vectors), np.ones(config.condition)])[: config.condition]
 
-    def of(values: Array, factors: np.ndarray) -> Array:
-        return values * jnp.where(chosen.reshape(-1, *(1,) * (values.ndim - 1)), factors, 1)
+    def of(values: Array, factors: Array) -> Array:
+        return values * (factors if values.ndim == 2 else factors[:, None])
 
     return ends._replace(
-        belief=ends.belief._replace(mean=of(ends.belief.mean, state.REFLECTED)),
-        state=of(ends.state, state.REFLECTED),
-        pose=of(ends.pose, poses.REFLECTED),
-        condition=None if ends.condition is None else of(ends.condition, force),
+        belief=ends.belief._replace(mean=of(ends.belief.mean, factors)),
+        state=of(ends.state, factors),
+        pose=of(ends.pose, factors[:, : poses.CODE]),
+        condition=None if ends.condition is None else of(ends.condition, jnp.where(chosen, vectors, 1)),
     )
 
 

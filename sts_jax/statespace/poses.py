@@ -13,7 +13,6 @@ A motion from one pose to another has 6 numbers: the difference of the position 
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from sts_jax import geometry
@@ -21,8 +20,6 @@ from sts_jax import geometry
 CODE = 12  # numbers in a pose code
 MOVE = CODE + 9  # numbers in a final pose code and in the matrix of the rotation from the first to the final pose
 MOTION = 6  # numbers in a motion
-SIDES = np.array([-1, 1, 1], np.float32)  # factors of a vector under the reflection x -> -x of the whole scene
-REFLECTED = np.concatenate([SIDES, np.outer(SIDES, SIDES).ravel()])  # the same for the numbers of a pose code
 LEVEL = 0.85  # an axis is level if the length of its projection onto the pad is above this
 
 

@@ -26,9 +26,6 @@ MEAN = 3.0  # subtracted from support functions, in units of LENGTH
 MASS = 0.05  # kg, unit of the mass
 SIZES = (poses.CODE, SUPPORT, 3, 1, SUPPORT, 3)  # numbers of each part
 CODE = sum(SIZES)  # numbers in a state code
-_FORM = harmonics.reflected(SUPPORT), poses.SIDES
-# Factors of the numbers of a state code under the reflection x -> -x of the whole scene, the object included
-REFLECTED = np.concatenate([poses.REFLECTED, *_FORM, np.ones(1, np.float32), *_FORM])
 
 
 class State(NamedTuple):
@@ -91,6 +88,22 @@ def turn(angle: Float[Array, "n 2"], state: State) -> State:
             [poses.turn(angle, state.com_in_sensor[:, :2]), state.com_in_sensor[:, 2:]], axis=-1
         ),
     )
+
+
+def reflection(code: Float[Array, "n code"]) -> Float[Array, "n code"]:
+    """Factors of the numbers of state codes under the reflection x -> -x of the whole scene.
+
+    In its mesh frame, each object is reflected across the coordinate plane that changes its shape the least, so that a
+    reflected fork has its handle on the same side as other forks.
+    """
+    forms, sides = harmonics.reflected(SUPPORT), 1 - 2 * np.eye(3)
+    across = sides[0]
+    options = [
+        np.concatenate([across, np.outer(across, own).ravel(), form, own, [1], forms[0], across])
+        for own, form in zip(sides, forms, strict=True)
+    ]
+    change = jnp.einsum("nk,ak->na", split(code).support ** 2, (1 - forms) / 2)
+    return jnp.asarray(np.stack(options), code.dtype)[jnp.argmin(change, axis=-1)]
 
 
 def turn_variance(angle: Float[Array, "n 2"], variance: State) -> State:
