@@ -1,7 +1,7 @@
 """Log evidence of the MVAE on Fashion-MNIST images and labels, beside the published one.
 
     apt-get install dataset-fashion-mnist
-    python -m benchmarks.fashion                # 80 minutes on two CPU cores, can be stopped and started again
+    python -m benchmarks.fashion                # half an hour on two CPU cores, can be stopped and started again
     python -m benchmarks.fashion --epochs 1     # minutes
 
 The loss is the sum of the bounds of all three subsets of image and label, each of which predicts its own members. The
@@ -36,7 +36,7 @@ class Args:
 
     workdir: Path = Path("runs/fashion")  # folder of the model
     data: Path = DATA  # folder of the four files of the data set
-    epochs: int = 50  # passes over the 60,000 training images
+    epochs: int = 20  # passes over the 60,000 training images
     latent: int = 64  # components of the latent (Wu and Goodman: 64)
     widths: tuple[int, int, int, int] = (32, 64, 128, 256)  # channels after each convolution
     hidden: int = 512  # width between two fully connected layers
