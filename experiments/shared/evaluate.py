@@ -213,7 +213,7 @@ def _notes(
     run: Run, logs: Mapping[str, Sequence[Mapping]], scores: Mapping[str, evaluation.Scores], test: dataset.Pairs
 ) -> list[str]:
     """The notes below a table: the schedule of the training, the ceiling, and what touch adds to vision."""
-    steps = ", ".join(f"{name} {log[-1]['step'] if log else 0}" for name, log in logs.items())
+    steps = ", ".join(f"{name} {log[-1]['step'] if log else 0:.0f}" for name, log in logs.items())
     notes = [
         f"Gradient steps: {steps}, batch {run.config.schedule.batch_size}.",
         f"Ceiling: {run.config.rerolls} re-rolls of the hidden values of each start. Touch can reveal a part of these "
