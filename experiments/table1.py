@@ -16,6 +16,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
+import jax
 import numpy as np
 import tyro
 
@@ -122,6 +123,7 @@ def main(config: Config, workdir: Path) -> None:
                 spent, expected = spent + time.monotonic() - start, expected + left[cell]
                 rest = sum(left[other] for other in todo[number:]) * spent / expected
                 say(f"[{number}/{len(todo)}] {cell.name}: {time.monotonic() - start:.0f} s, {_minutes(rest)} left")
+            jax.clear_caches()  # programs of all models together would exceed Linux' limit of maps (vm.max_map_count)
             following = todo[number] if number < len(todo) else None
             if following is None or following[0] != cell[0]:  # a scenario of a seed is complete
                 write(config, workdir, scenes, references)
@@ -183,6 +185,7 @@ def draw(config: Config, workdir: Path, sensor: sts.Sensor, scenes: dict[str, ce
             parts = {"train": scene.train, "validation": scene.validation, "test": scene.test}
             found = evaluation.probe(final["mvae"], scene.data, parts, dataset.class_names(scene.collection))
             texts.append(evaluation.probes_table(found, title=f"{name}: {NAMES['mvae']}, final-step"))
+        jax.clear_caches()
     storage.write_bytes(workdir / "probes.md", "\n".join(texts).encode())
     evaluate.record(workdir, "figures", checksums, [*files, workdir / "probes.md"])
 

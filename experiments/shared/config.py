@@ -52,7 +52,6 @@ STATE_TRAINING = TrainConfig(
     warmup=150,
     b2=0.99,
     clip=200.0,
-    falls=192,
     beta_warmup=0.2,
 )
 

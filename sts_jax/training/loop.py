@@ -53,7 +53,7 @@ class TrainConfig:
     batch_size: int = field(default=64, metadata=COUNT)  # samples in a batch (paper: 64)
     # For state-space models: first frames without a trajectory, and trajectories without images, in a batch
     views: int = field(default=16, metadata=NUMBER)
-    falls: int = field(default=96, metadata=NUMBER)
+    falls: int = field(default=192, metadata=NUMBER)
     learning_rate: float = field(default=1e-3, metadata=POSITIVE)  # learning rate of Adam (not in the paper)
     schedule: Literal["constant", "cosine"] = "constant"  # course of the learning rate. cosine falls to 0 at the end
     warmup: int = field(default=0, metadata=NUMBER)  # first steps, in which the learning rate rises linearly from 0
