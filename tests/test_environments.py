@@ -62,6 +62,7 @@ def test_gymnasium_makes_it_with_a_time_limit():
     assert GymLift.metadata["render_modes"] == ["rgb_array"]
 
 
+@pytest.mark.slow
 def test_a_firm_grasp_lifts_and_a_light_one_slips(gym_lift):
     rises = {}
     for friction, squeeze in ((0.3, 0.1), (0.3, 0.5), (1.0, 0.1)):

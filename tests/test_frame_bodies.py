@@ -79,6 +79,7 @@ def interior_of(body):
     return (body >= 0) & (around == body).all(0)
 
 
+@pytest.mark.slow
 def test_two_bodies_equal_two_single_frames_composed_by_depth():
     items = [(body, *placement) for body, placement in zip((BOX, BALL), PRESSED, strict=True)]
     frame = many(*items)

@@ -61,6 +61,7 @@ def test_dots_move_with_the_skin_under_a_ball_and_nowhere_else_in_both_streams(f
         assert shift[1] == pytest.approx(-0.4 * shift[0], rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_shear_under_several_bodies_is_the_sum_and_a_body_that_does_not_press_has_none():
     places = jnp.stack([at(x, y, 0.03) for x, y in ((0.04, 0.0), (-0.04, 0.01), (0.0, -0.05))])
     wrenches = jnp.stack(

@@ -125,6 +125,7 @@ def test_the_loss_is_the_sum_of_the_exact_conditional_evidence_of_all_subsets(as
     np.testing.assert_allclose(terms.kl, divergence, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_evidence_of_image_category_and_vector_equals_an_integral_on_a_grid():
     modalities = (
         mvae.Modality("image", "image", (32, 32, 1)),

@@ -81,6 +81,7 @@ def test_the_gradient_of_rigid_is_finite_and_equals_finite_differences():
     np.testing.assert_allclose(grad(0.3), (height(0.32) - height(0.28)) / 0.04, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_stacked_bodies_can_be_mapped_over():
     bodies = [objects.make(jax.random.key(k), c) for k, c in enumerate(("bottle", "fork", "watch"))]
     several = objects.stack(bodies)

@@ -227,9 +227,8 @@ print(len(done))
 """
 
 
-@pytest.mark.parametrize(
-    ("count", "rounds"), [pytest.param(4, 3), pytest.param(60, 5, marks=pytest.mark.slow)], ids=["4", "60"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("count", "rounds"), [(4, 3), (60, 5)], ids=["4", "60"])
 def test_two_threads_predict_at_the_same_time(count, rounds):
     """With an eigenvalue decomposition of LAPACK in the program, both threads waited for ever."""
     run = subprocess.run(

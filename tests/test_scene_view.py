@@ -184,6 +184,7 @@ def gripper() -> tuple[mujoco.MjModel, scene.View]:
     return model, scene.View(model, {"left": SMALL, "right": SMALL})
 
 
+@pytest.mark.slow
 def test_a_mirrored_scene_gives_mirrored_images(gripper):
     model = gripper[0]
     # The lamps of the room are not symmetric.
@@ -204,6 +205,7 @@ def test_a_mirrored_scene_gives_mirrored_images(gripper):
     assert np.abs(frames[0]["left"].depth - frames[0]["right"].depth[:, ::-1])[frames[0]["left"].body == 4].max() > 1e-3
 
 
+@pytest.mark.slow
 def test_each_finger_sees_the_other_one_but_not_itself(gripper):
     model, view = gripper
     data = mujoco.MjData(model)
@@ -229,6 +231,7 @@ def test_bodies_and_geoms_can_be_hidden(objects):
     assert scene.View(compiled(BALL + CLOTH), {"pad": SENSOR}, hide=["cloth"]).bodies == ("ball",)
 
 
+@pytest.mark.slow
 def test_a_body_can_replace_the_geoms_of_a_body(objects):
     model, data, view, frame = objects
     ball = geometry.body_of(model, [model.geom("block").id])

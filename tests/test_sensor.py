@@ -164,6 +164,7 @@ def test_flipped_bits_of_a_saved_sensor_are_found_and_edited_files_are_accepted_
     Sensor.load(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [0.0375, 0.04, 0.6])
 def test_a_similar_body_under_the_same_force_gives_the_same_images_on_a_similar_sensor(width):
     like = Sensor(lights=tactile.Leds(), skin=tactile.Skin(coupling=0.0007, shadow_steps=4), markers=tactile.Markers())
