@@ -114,6 +114,7 @@ def main(args: Args) -> str:
                 path, shown = folder.with_name(f"{folder.name}-{PICTURES[given_by]}.png"), evaluation.take(row, items)
                 title = f"{args.model}, {given_by}: new objects"
                 drawing.draw_predictions(path, made, sensor, given.take(items), shown, title)
+            del row  # gigabytes of samples
     notes = [
         f"Outcomes drawn from the model's probabilities {title}: calibration error "
         f"{if_calibrated(errors[evaluation.CALIBRATION][:, 0]):.3f}."
