@@ -121,7 +121,7 @@ class Sensor:
                 raise ValueError(message())
         if not flags:
             return self, True
-        # Without the barrier, XLA repeats all conditions in every kernel that uses a constant, and compiles twice as long.
+        # A sum, because XLA repeats the conditions of `jnp.all` in every kernel, and compiles a third longer.
         sound = jnp.sum(jnp.stack(flags).astype(jnp.int32)) == len(flags)
 
         def safe(value: Any, default: Any) -> Any:
