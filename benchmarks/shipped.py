@@ -1,6 +1,6 @@
 """Metrics of the models that come with the library, on many objects that no model was trained on.
 
-    python -m benchmarks.shipped perturbed    # about 15 minutes on two CPU cores, 5 GB of memory
+    python -m benchmarks.shipped perturbed    # about 15 minutes on two CPU cores, 8 GB of memory
     python -m benchmarks.shipped perturbed --trained runs/perturbed/models/statespace    # another trained model
 
 An experiment has few held-out objects, so its intervals are wide. This command draws new objects, and simulates and

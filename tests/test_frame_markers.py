@@ -93,6 +93,8 @@ def test_touch_draws_the_dots_at_a_given_displacement_of_the_skin():
 def test_the_derivative_of_the_image_by_the_tangential_force_equals_finite_differences():
     weights = jnp.asarray(np.random.default_rng(0).normal(size=(32, 32, 3)), jnp.float32)
 
+    @jax.jit
+    @jax.value_and_grad
     def value(force):
         wrench = load(0.02, -0.03) + jnp.stack(
             [-force[0], -force[1], *jnp.zeros(3), -0.02 * force[1] - 0.03 * force[0]]
@@ -102,7 +104,7 @@ def test_the_derivative_of_the_image_by_the_tangential_force_equals_finite_diffe
         )
 
     force, step = jnp.array([0.2, 0.05]), jnp.array([0.002, -0.003])
-    slope = jax.grad(value)(force)
-    difference = value(force + step) - value(force - step)
+    slope = value(force)[1]
+    difference = value(force + step)[0] - value(force - step)[0]
     assert float(jnp.sum(slope * 2 * step)) == pytest.approx(float(difference), rel=0.05)
     assert abs(float(difference)) > 0.01

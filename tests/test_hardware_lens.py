@@ -198,7 +198,7 @@ def test_a_view_is_relit_by_the_ratio_of_the_empty_pads():
 @pytest.mark.slow
 def test_the_view_of_a_twin_is_the_rendering_of_the_pose_and_gives_the_same_prediction():
     height, width = 480, 640
-    sensor, body = sts.Sensor(), sts.objects.make(jax.random.key(0), "camera")
+    sensor, body = sts.Sensor(), sts.objects.make(jax.random.key(1), "camera")
     scene = twin.ObjectScene(body, sensor=sensor, resolution=(height, width), motion_rate=0.2)
     lens = hardware.Lens.ideal(width, height)
     with twin.Twin(scene, lens=lens) as device:

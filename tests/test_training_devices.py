@@ -16,7 +16,7 @@ from sts_jax import training
 from sts_jax.training.devices import Devices
 
 HERE = Path(__file__).parent
-CONFIG = training.TrainConfig(steps=8, batch_size=8, log_every=2, checkpoint_every=4)
+CONFIG = training.TrainConfig(steps=8, batch_size=8, falls=32, log_every=2, checkpoint_every=4)
 
 # Trains in this process, one of `count`, and writes the rows that it read. With `stop`, it ends after this step.
 WORKER = """
@@ -70,7 +70,7 @@ def run(workdir, kind="small", *, count=1, devices=1, stop=0, batch_size=8):
         )
         for i in range(count)
     ]
-    errors = [worker.communicate(timeout=300)[1] for worker in workers]
+    errors = [worker.communicate(timeout=900)[1] for worker in workers]
     return [worker.returncode for worker in workers], errors
 
 
