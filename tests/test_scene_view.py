@@ -139,13 +139,19 @@ def test_given_wrenches_replace_those_of_the_data(objects):
 
 
 @pytest.mark.slow
-def test_a_batch_of_mjx_data_under_jit_gives_the_same_frames(objects):
+@pytest.mark.parametrize("impl", ["jax", "warp"])
+def test_a_batch_of_mjx_data_under_jit_gives_the_same_frames(objects, impl):
     model, data, view, frame = objects
     moved = forward(model)
     moved.qpos[:3] += [0.01, 0, 0]
     mujoco.mj_forward(model, moved)
-    each = [mjx.put_data(model, one) for one in (data, moved)]
-    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
+    if impl == "warp":
+        pytest.importorskip("warp")  # not a dependency: pip install warp-lang
+        placed = jax.vmap(lambda qpos: mjx.make_data(model, impl=impl).replace(qpos=qpos))
+        batch = placed(jnp.asarray([data.qpos, moved.qpos], jnp.float32))
+        batch = jax.jit(jax.vmap(mjx.forward, (None, 0)))(mjx.put_model(model, impl=impl), batch)
+    else:
+        batch = jax.tree.map(lambda *x: jnp.stack(x), *[mjx.put_data(model, one) for one in (data, moved)])
     frames = jax.jit(jax.vmap(functools.partial(view, resolution=SIZE)))(batch)["pad"]
     for index, expected in enumerate((frame, view(moved, resolution=SIZE)["pad"])):
         np.testing.assert_allclose(frames.visual[index], expected.visual, atol=1e-5)
