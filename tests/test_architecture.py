@@ -13,11 +13,11 @@ ROOMS = [
     for name, paths, lines, budget in re.findall(r"^\| ([^|`]+) \| (`[^|]+) \| ([\d,]+) \| ([\d,]+) \|$", PAGE, re.M)
 ]
 TOTALS = {
-    "library without hardware": 26_270,
+    "library without hardware": 26_330,
     "hardware": 5_110,
     "experiments": 7_260,
     "benchmarks": 5_800,
-    "tests": 25_250,
+    "tests": 25_310,
 }
 
 

@@ -52,6 +52,8 @@ class Config:
     # True: the decoder predicts the outline of the imprint in the tactile image, so that samples have sharp imprints.
     # False: it predicts only a mean tactile image, as in the models that come with the library
     imprints: bool = False
+    # channels of a network that adjusts an imprint to its outline in a sample, which `imprints` must predict. 0: none
+    shading: int = 0
     # True: in the training of the transition, every second trajectory is reflected (x -> -x). This is right if the
     # scenario has no preferred side
     reflected: bool = False
@@ -80,6 +82,8 @@ class Config:
                 f"condition must be >= 2 * vectors >= 0, got condition={self.condition} and vectors={self.vectors}: "
                 "set condition to len(scenario.condition_scale) and vectors to scenario.vectors"
             )
+        if self.shading < 0 or (self.shading and not self.imprints):
+            raise ValueError(f"shading must be 0, or >= 1 with imprints=True, got {self.shading} and {self.imprints}")
         if self.stride < 0 or (self.stride and self.outcomes != 1):
             raise ValueError(
                 f"stride must be 0, or >= 1 with outcomes=1, got stride={self.stride} and outcomes={self.outcomes}"

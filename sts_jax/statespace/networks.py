@@ -77,6 +77,7 @@ def compose(
     empty: dict[str, Float[Array, "size size 3"]],
     level: Float[Array, "n"] | None = None,
     contrast: float | Float[Array, "n"] = CONTRAST,
+    shading: "Shading | None" = None,
 ) -> dict[str, Float[Array, "n size size 3"]]:
     """Combine the rendered objects with the images of the empty sensor, of the same size.
 
@@ -89,6 +90,7 @@ def compose(
         empty: `visual` and `tactile` image of the empty sensor in [0, 1].
         level: Threshold for each object, from 0 to 1, or None.
         contrast: Sharpness of the outlines if there is a threshold.
+        shading: The decoder's, for a tactile image that follows the outline of the imprint.
 
     Returns:
         The images `visual` and `tactile` of each object, in [0, 1].
@@ -101,12 +103,25 @@ def compose(
         return jax.nn.sigmoid(jnp.reshape(contrast, (-1, 1, 1, 1)) * (logit - jnp.log(limit / (1 - limit))))
 
     covered = outlined(layers.covered)
-    grey = jnp.clip(empty["tactile"], 0.01, 0.99)
-    tactile = jax.nn.sigmoid(jnp.log(grey / (1 - grey)) + layers.touch)
-    if layers.pressed is not None:
-        pressed = outlined(layers.pressed)
-        tactile = pressed * tactile + (1 - pressed) * empty["tactile"]
-    return {"visual": covered * layers.colour + (1 - covered) * empty["visual"], "tactile": tactile}
+    pressed = None if layers.pressed is None else outlined(layers.pressed)
+    return {
+        "visual": covered * layers.colour + (1 - covered) * empty["visual"],
+        "tactile": imprinted(layers.touch, pressed, empty["tactile"], shading),
+    }
+
+
+def imprinted(
+    touch: Float[Array, "n size size 3"],
+    pressed: Float[Array, "n size size 1"] | None,
+    empty: Float[Array, "size size 3"],
+    shading: "Shading | None" = None,
+) -> Float[Array, "n size size 3"]:
+    """Tactile images in [0, 1]: the changes `touch` of the logits, where the weights `pressed` show an imprint."""
+    grey = jnp.clip(empty, 0.01, 0.99)
+    if shading is not None and pressed is not None:
+        touch = touch + shading(pressed, touch)
+    image = jax.nn.sigmoid(jnp.log(grey / (1 - grey)) + touch)
+    return image if pressed is None else pressed * image + (1 - pressed) * empty
 
 
 def _conv(x: Array, kernel: Array, *args: Any, **options: Any) -> Array:
@@ -348,6 +363,7 @@ class Decoder(nnx.Module):
         self.layers = nnx.List([_Residual(width, rngs) for width in (eighth, quarter, half)])
         self.enlarge = nnx.List([nnx.Linear(a, 4 * b, rngs=rngs) for a, b in ((eighth, quarter), (quarter, half))])
         self.last = nnx.Conv(half, 4 * 8, (3, 3), kernel_init=_SMALL, conv_general_dilated=_conv, rngs=rngs)
+        self.shading = Shading(config.shading, rngs) if config.shading else None
 
     def __call__(
         self,
@@ -387,6 +403,29 @@ class Decoder(nnx.Module):
         colour = jax.nn.sigmoid(x[..., :3] + jnp.log(tint / (1 - tint)))
         covered, pressed = (x[..., i : i + 1] - _OUTSIDE - 3 for i in (3, 7))
         return Layers(covered, colour, touch=x[..., 4:7], pressed=pressed if config.imprints else None)
+
+
+class Shading(nnx.Module):
+    """Corrects the change of a tactile image by the outline of the imprint, whose edges reflect the lights.
+
+    The decoder knows the edges of an imprint only as probabilities, and therefore predicts the mean over their possible
+    places. For one outline, the edges are at known places.
+    """
+
+    def __init__(self, width: int, rngs: nnx.Rngs) -> None:
+        self.layers = nnx.List(
+            [nnx.Conv(a, width, (3, 3), conv_general_dilated=_conv, rngs=rngs) for a in (4 * 4, width)]
+        )
+        self.last = nnx.Conv(width, 4 * 3, (3, 3), kernel_init=_SMALL, conv_general_dilated=_conv, rngs=rngs)
+
+    def __call__(
+        self, pressed: Float[Array, "n size size 1"], touch: Float[Array, "n size size 3"]
+    ) -> Float[Array, "n size size 3"]:
+        """The correction of the changes `touch` of the logits. `pressed` is the weight of the imprint in each pixel."""
+        x = _fold(jnp.concatenate([pressed, pressed * touch], axis=-1))
+        for layer in self.layers:
+            x = jax.nn.swish(layer(x))
+        return _unfold(self.last(x))
 
 
 def _on_canvas(

@@ -9,6 +9,7 @@
 - `first`: the sum of the terms `visual` and `tactile`, but computed for the input images of the first frame
 - `covered`: the cross-entropy of the probability that a pixel shows the object, for both frames, and with
   `Config.imprints` that of the probability that a pixel of the tactile image shows an imprint
+- `shaded`: with `Config.shading`, the term `tactile` of images with the true outline of the imprint
 - `look`: the divergence of the appearance code from its prior, multiplied by `beta` in the loss
 
 The decoder renders the object in its true pose in each of the two frames. It therefore never learns a mean of images
@@ -48,6 +49,7 @@ from sts_jax.statespace.networks import (
     counted,
     experts,
     fuse,
+    imprinted,
     moved,
     of_state,
     reduced,
@@ -238,7 +240,7 @@ def loss(
     weights = config.weights
     total = (
         terms["visual"]
-        + weights.tactile * terms["tactile"]
+        + weights.tactile * (terms["tactile"] + terms.get("shaded", 0))
         + weights.covered * terms["covered"]
         + weights.first * terms["first"]
         + weights.state * terms["state"]
@@ -443,6 +445,11 @@ def _picture_terms(
     if layers.pressed is not None:
         imprint = window.shows(after.images["tactile"] - small["tactile"])
         terms["covered"] += jnp.mean(_outline_nats(layers.pressed[:number], imprint))
+        if model.decoder.shading is not None:
+            # The true outline alone trains the shading, and the shading trains nothing else.
+            change = jax.lax.stop_gradient(layers.touch[:number])
+            shaded = imprinted(change, imprint[..., None], small["tactile"], model.decoder.shading)
+            terms["shaded"] = jnp.mean(excess(shaded, after.images["tactile"]))
     for name, image in before.images.items():
         counts = before.counts[name]
         target = reduced(counted(counts, image), size)

@@ -132,8 +132,9 @@ def sample(
     contrast = jnp.full(len(samples.outcome), CONTRAST)
     if correction is not None:
         contrast = of_items(model.config, correction, present).contrast
-    sharp = compose(samples.layers, samples.empty, samples.level, jnp.tile(contrast, drawn))
-    soft = compose(samples.layers, samples.empty)
+    shading = model.decoder.shading
+    sharp = compose(samples.layers, samples.empty, samples.level, jnp.tile(contrast, drawn), shading)
+    soft = compose(samples.layers, samples.empty, shading=shading)
     return Samples(
         belief=samples.belief,
         outcome=samples.outcome,

@@ -177,10 +177,8 @@ def render(
     else:
         looks, level = drawn_looks(appearance, belief, num), drawn_levels(outline, num)
     layers = rendered(model, belief, looks, pose, turn)
-    sharp, soft = (
-        {name: x.reshape(*pose.shape[:2], *x.shape[1:]) for name, x in compose(layers, shown, chosen).items()}
-        for chosen in (level, None)
-    )
+    pictures = (compose(layers, shown, chosen, shading=model.decoder.shading) for chosen in (level, None))
+    sharp, soft = ({name: x.reshape(*pose.shape[:2], *x.shape[1:]) for name, x in p.items()} for p in pictures)
     return sharp, {name: x.mean(0) for name, x in soft.items()}
 
 

@@ -531,6 +531,7 @@ def state_model(
         input_size=height,
         image_size=image_size,
         imprints=True,
+        shading=24,
         reflected=scenario.symmetric,
         camera_distance=float(sensor.camera.distance),
         view=float(optics.full_window(sensor.camera, preprocessing.resolution)[2]),
