@@ -428,6 +428,7 @@ def test_half_of_the_trajectories_are_reflected_with_their_turns_and_jerks(batch
         ({"inputs": ("pose", "visual")}, "inputs must be some of .* in this order, with an image"),
         ({"window": 12}, "window must be a positive multiple of 8 pixels, got 12"),
         ({"input_size": 24}, "input_size must be a positive multiple of 16 pixels, the image_size, got 24"),
+        ({"shading": 4}, "shading must be 0, or >= 1 with imprints=True and an even image_size, got shading=4"),
         ({"condition": 1}, r"condition must be >= 2 \* vectors >= 0, got condition=1 and vectors=1"),
         ({"outcome_names": ("rests",)}, "outcome_names must be empty or have 3 names"),
         ({"weights": {"touch": 1.0}}, r"field model\.weights\.touch is unknown"),

@@ -82,8 +82,11 @@ class Config:
                 f"condition must be >= 2 * vectors >= 0, got condition={self.condition} and vectors={self.vectors}: "
                 "set condition to len(scenario.condition_scale) and vectors to scenario.vectors"
             )
-        if self.shading < 0 or (self.shading and not self.imprints):
-            raise ValueError(f"shading must be 0, or >= 1 with imprints=True, got {self.shading} and {self.imprints}")
+        if self.shading < 0 or (self.shading and (not self.imprints or self.image_size % 2)):
+            raise ValueError(
+                f"shading must be 0, or >= 1 with imprints=True and an even image_size, got shading={self.shading}, "
+                f"imprints={self.imprints} and image_size={self.image_size}"
+            )
         if self.stride < 0 or (self.stride and self.outcomes != 1):
             raise ValueError(
                 f"stride must be 0, or >= 1 with outcomes=1, got stride={self.stride} and outcomes={self.outcomes}"
