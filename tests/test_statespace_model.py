@@ -251,6 +251,7 @@ def test_shading_finds_the_edges_of_an_imprint_from_its_outline():
     assert error(params, other) < 0.1 * before
 
 
+@pytest.mark.slow  # compiles a loss of its own
 def test_shading_is_trained_by_the_true_outline_and_trains_nothing_else(batch):
     graphdef, params, _ = statespace.init(jax.random.key(0), dataclasses.replace(CONFIG, imprints=True, shading=4))
 
