@@ -44,7 +44,7 @@ class SeenBoards(SeenLights):
         self.noises = [rng.integers(0, 5, (HEIGHT, WIDTH, 3), np.uint8) for _ in range(3)]
         super().__init__(lights, fps=30, lag_s=0.01, exposure_s=0.01, size=(WIDTH, HEIGHT))
 
-    def _frame(self):
+    def _frame(self, mode):
         end_s = time.monotonic() - self.lag_s
         _, mean = self.lights.shares(end_s - self.exposure_s, end_s)
         plain = np.full((HEIGHT, WIDTH, 3), DARK + mean * (LIT - DARK), np.uint8)

@@ -129,15 +129,16 @@ class MotionJpeg:
                 due = time.monotonic()
             due += 1 / self.fps
             time.sleep(max(due - time.monotonic(), 0))
-            if self.mode != "repeat":
+            mode = self.mode  # read once for each frame, because another thread may change it
+            if mode != "repeat":
                 self.number += 1
-            if self.mode == "skip" and self.number in self.skipped:
+            if mode == "skip" and self.number in self.skipped:
                 continue
-            if self.mode != "repeat" or not self._last:
-                self._last = self._frame()
+            if mode != "repeat" or not self._last:
+                self._last = self._frame(mode)
             self.served.setdefault(self.number, time.monotonic())
             held.append(self._last)
-            if self.mode != "held":
+            if mode != "held":
                 for frame in held:
                     request.send_frame(frame)
                 held = []
@@ -146,16 +147,16 @@ class MotionJpeg:
         while self.running and self.mode == mode:
             time.sleep(0.01)
 
-    def _frame(self) -> bytes:
+    def _frame(self, mode: str) -> bytes:
         width, height = self.size
         if self.colour is not None:  # the corner alternates, because identical frames would count as frozen
             image = np.full((height, width, 3), self.colour, np.uint8)
             image[:16, :16] = 60 + self.number % 2 * 100
             return jpeg(image)
-        if self.mode == "black":
+        if mode == "black":
             return jpeg(np.zeros((height, width, 3), np.uint8))
-        data = jpeg(draw(self.number, (width // 2, height // 2) if self.mode == "small" else self.size))
-        return data[: len(data) // 2] if self.mode == "damaged" else data
+        data = jpeg(draw(self.number, (width // 2, height // 2) if mode == "small" else self.size))
+        return data[: len(data) // 2] if mode == "damaged" else data
 
 
 class Peer:
@@ -343,9 +344,9 @@ class SeenLights(MotionJpeg):
         self.spot: tuple[int, int, int] | None = None  # column, row and radius of a dark object (pixels)
         super().__init__(fps=fps, size=size)
 
-    def _frame(self) -> bytes:
-        if self.mode in ("black", "small", "damaged"):
-            return super()._frame()
+    def _frame(self, mode: str) -> bytes:
+        if mode in ("black", "small", "damaged"):
+            return super()._frame(mode)
         end_s = time.monotonic() - self.lag_s
         shares, mean = self.lights.shares(end_s - self.exposure_s, end_s)
         self.log[self.number] = Exposure(shares, mean, end_s - self.exposure_s, end_s)
