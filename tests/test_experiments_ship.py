@@ -1,14 +1,19 @@
 """A model of a work directory becomes a model of the library and replaces an earlier one, unless it is refused."""
 
+import dataclasses
 import re
 import shutil
 
+import jax
+import made_up_dataset
 import numpy as np
 import pytest
-from statespace_config import STATE, state_model
+from flax import nnx
+from statespace_config import STATE, state_model, untrained
 
 import sts_jax as sts
 from experiments import ship
+from sts_jax import statespace, storage, training
 
 
 @pytest.fixture
@@ -68,6 +73,38 @@ def test_an_earlier_model_stays_if_the_new_one_is_refused(models, workdir, monke
         ship.ship(workdir, "falls")
     assert content(models) == {"falls/config.json": b"earlier"}
     assert [path.name for path in models.iterdir()] == ["falls"]
+
+
+@pytest.mark.slow
+def test_the_copy_is_calibrated_on_another_dataset(models, tmp_path, monkeypatch):
+    workdir, folder, collection = tmp_path / "runs/falls", tmp_path / "others", made_up_dataset.COLLECTION
+    monkeypatch.setattr(made_up_dataset, "SIZE", STATE.input_size)
+    monkeypatch.setattr(
+        made_up_dataset, "COLLECTION", dataclasses.replace(collection, resolution=(STATE.input_size,) * 2)
+    )
+    original = untrained(dataclasses.replace(STATE, outcomes=4), condition_scale=(1.0, 1.0, 1.0))
+    original.save(workdir / "models/statespace")
+    made_up_dataset.write(folder)
+    ship.ship(workdir, "falls", folder)
+    assert ".lock" not in content(models / "falls")
+    got = sts.Predictor.load("falls").model
+    data = sts.dataset.load(folder)
+    empty = {name: np.round(255 * image).astype(np.uint8) for name, image in original.empty.items()}
+    arrays = training.state_arrays(
+        data.pairs(data.rendered()), got.config, collection.scenario, original.preprocessing, empty
+    )
+    params, _ = nnx.split_state(got.state, nnx.Param, nnx.BatchStat)
+    expected = statespace.fit_calibration(
+        got.graphdef, params, arrays.inputs, arrays.targets, empty, condition=arrays.condition
+    )
+    for one, other in zip(jax.tree.leaves(got.calibration), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4)
+    assert np.ptp(got.calibration.variance) > 0.1
+    storage.write_json(workdir / "config.json", {"collection": {"seed": collection.seed}})
+    files = content(models / "falls")
+    with pytest.raises(ValueError, match=r"others has the seed 3 of the training objects.* with another seed"):
+        ship.ship(workdir, "falls", folder)
+    assert content(models / "falls") == files
 
 
 @pytest.mark.parametrize("name", ["..", "runs/falls", "free fall"])

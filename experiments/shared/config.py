@@ -172,10 +172,10 @@ class Extensions:
 NONE = Extensions()
 
 
-def long(default: Config, *, num_per_object: int = 10, steps: int = 8000) -> Config:
+def long(default: Config, *, num_objects: int = 6000, num_per_object: int = 10, steps: int = 8000) -> Config:
     """A configuration with more objects and gradient steps, which takes hours."""
     collection = dataclasses.replace(
-        default.collection, num_objects=6000, num_per_object=num_per_object, shares=(0.97, 0.01, 0.02)
+        default.collection, num_objects=num_objects, num_per_object=num_per_object, shares=(0.97, 0.01, 0.02)
     )
     training = dataclasses.replace(default.state_training, steps=steps)
     return dataclasses.replace(default, collection=collection, state_training=training)
