@@ -198,41 +198,43 @@ def test_a_view_is_relit_by_the_ratio_of_the_empty_pads():
 @pytest.mark.slow
 def test_the_view_of_a_twin_is_the_rendering_of_the_pose_and_gives_the_same_prediction():
     height, width = 480, 640
-    sensor, body = sts.Sensor(), sts.objects.make(jax.random.key(1), "camera")
-    scene = twin.ObjectScene(body, sensor=sensor, resolution=(height, width), motion_rate=0.2)
-    lens = hardware.Lens.ideal(width, height)
-    with twin.Twin(scene, lens=lens) as device:
+    sensor, predict, lens = sts.Sensor(), sts.Predictor.load("freefall"), hardware.Lens.ideal(width, height)
+    ratios = []
+    for seed in range(3):  # the prediction of one object may jump with the noise of its view
+        body = sts.objects.make(jax.random.key(seed), "bottle")
+        scene = twin.ObjectScene(body, sensor=sensor, resolution=(height, width), motion_rate=0.2)
+        with twin.Twin(scene, lens=lens) as device:
 
-        def view():
-            images = []
-            for levels in ((0,) * 4, (255,) * 4):
-                device.set(levels)
-                device.step(0.2)
-                exposure, image = device.capture()
-                images.append(image)
-            return exposure.pose, hardware.sensor_view(lens, sensor.camera, *images, (128, 128))
+            def view(device=device):
+                images = []
+                for levels in ((0,) * 4, (255,) * 4):
+                    device.set(levels)
+                    device.step(0.2)
+                    exposure, image = device.capture()
+                    images.append(image)
+                return exposure.pose, hardware.sensor_view(lens, sensor.camera, *images, (128, 128))
 
-        empties = [view()[1] for _ in range(10)]
-        device.command("hold")
-        pose, found = view()
-    background = hardware.SensorView(*(np.mean(images, axis=0) for images in zip(*empties, strict=True)))
-    wrench = jnp.asarray(scene._motion(0).wrench[0])
-    predict = sts.Predictor.load("freefall")
-    frame = sts.sense(sensor, body, jnp.asarray(pose), wrench, resolution=(128, 128))
-    lit = hardware.relit(found, background, hardware.SensorView(**predict.empty))
-    for stream in ("visual", "tactile"):
-        truth, image = np.asarray(getattr(frame, stream)), getattr(lit, stream)
-        difference, wrong = 255 * np.abs(image - truth), 255 * np.abs(image[:, ::-1] - truth)
-        print(f"{stream}: {difference.mean():.2f} of 255 on average, median {np.median(difference):.2f}")
-        assert difference.mean() < 2
-        assert np.median(difference) < 1.5  # noise of the frame and of the background
-        assert wrong.mean() > 1.5 * difference.mean()
-    plain, own, direct = (
-        np.asarray(predict(visual=image).visual) for image in (found.visual, lit.visual, np.asarray(frame.visual))
-    )
-    apart, without = 255 * np.abs(own - direct).mean(), 255 * np.abs(plain - direct).mean()
-    print(f"predictions: {apart:.2f} of 255 apart, {without:.2f} if the view is not relit")
-    assert apart < without / 3
+            empties = [view()[1] for _ in range(10)]
+            device.command("hold")
+            pose, found = view()
+        background = hardware.SensorView(*(np.mean(images, axis=0) for images in zip(*empties, strict=True)))
+        wrench = jnp.asarray(scene._motion(0).wrench[0])
+        frame = sts.sense(sensor, body, jnp.asarray(pose), wrench, resolution=(128, 128))
+        lit = hardware.relit(found, background, hardware.SensorView(**predict.empty))
+        for stream in ("visual", "tactile"):
+            truth, image = np.asarray(getattr(frame, stream)), getattr(lit, stream)
+            difference, wrong = 255 * np.abs(image - truth), 255 * np.abs(image[:, ::-1] - truth)
+            print(f"{stream}: {difference.mean():.2f} of 255 on average, median {np.median(difference):.2f}")
+            assert difference.mean() < 2
+            assert np.median(difference) < 1.5  # noise of the frame and of the background
+            assert wrong.mean() > 1.5 * difference.mean()
+        plain, own, direct = (
+            np.asarray(predict(visual=image).visual) for image in (found.visual, lit.visual, np.asarray(frame.visual))
+        )
+        apart, without = 255 * np.abs(own - direct).mean(), 255 * np.abs(plain - direct).mean()
+        print(f"predictions: {apart:.2f} of 255 apart, {without:.2f} if the view is not relit")
+        ratios.append(apart / without)
+    assert np.median(ratios) < 1 / 3
 
 
 # ---- Errors
