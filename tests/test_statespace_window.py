@@ -31,6 +31,18 @@ def test_window_follows_a_rectangle(angle):
     np.testing.assert_allclose(found.side[0], window.MARGIN * extent[0], atol=2.5 / SIZE)
 
 
+def test_window_ignores_noise():
+    size = 128
+    rng = np.random.default_rng(0)
+    clean = np.repeat(np.repeat(rectangle((0.45, 0.55), 0.5, (0.5, 0.2)), 2, 0), 2, 1)
+    noisy = clean + rng.normal(0, 4 / 255, (8, size, size, 3)).astype(np.float32)
+    assert window.shows(jnp.asarray(noisy - clean)).sum((1, 2)).min() > 50
+    expected, found = window.locate(jnp.asarray(clean[None])), window.locate(jnp.asarray(noisy))
+    np.testing.assert_allclose(found.centre, np.repeat(expected.centre, 8, 0), atol=1.5 / size)
+    np.testing.assert_allclose(found.angle, np.repeat(expected.angle, 8, 0), atol=0.01)
+    np.testing.assert_allclose(found.side, np.repeat(expected.side, 8), atol=2.5 / size)
+
+
 def test_window_of_an_unchanged_image_is_the_whole_image():
     faint = jnp.full((1, SIZE, SIZE, 3), 0.9 * window.THRESHOLD, jnp.float32)
     found = window.locate(faint)

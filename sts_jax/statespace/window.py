@@ -12,6 +12,8 @@ from sts_jax._sampling import bilinear_batch
 from sts_jax.statespace import poses
 
 THRESHOLD = 12 / 255  # a pixel is in the silhouette if a channel differs by more than this (shadows differ by less)
+DEVIATIONS = 5  # a window's silhouette has only differences above as many standard deviations of the image's noise
+LARGEST = 24 / 255  # larger differences between neighbouring pixels count as edges, and only in part as noise
 MARGIN = 1.1  # side of a window, divided by the larger extent of the silhouette
 SMALLEST = 0.08  # side of the smallest window, divided by the side of the image
 
@@ -27,9 +29,15 @@ class Window(NamedTuple):
     side: Float[Array, "n"]  # side of the square
 
 
-def shows(change: Float[Array, "n h w 3"]) -> Float[Array, "n h w"]:
-    """1 for pixels that differ from the empty sensor by more than 12/255 in any channel, else 0."""
-    return (jnp.max(jnp.abs(change), axis=-1) > THRESHOLD).astype(jnp.float32)
+def shows(change: Float[Array, "n h w 3"], least: Float[Array, "*n"] | float = THRESHOLD) -> Float[Array, "n h w"]:
+    """1 for pixels that differ from the empty sensor by more than `least` (default 12/255) in any channel, else 0."""
+    return (jnp.max(jnp.abs(change), axis=-1) > jnp.asarray(least)[..., None, None]).astype(jnp.float32)
+
+
+def noise(change: Float[Array, "n h w 3"]) -> Float[Array, "n"]:
+    """Standard deviation of the noise in each image, from the mean difference between neighbouring pixels."""
+    across = jnp.minimum(jnp.abs(jnp.diff(change, axis=2)), LARGEST)
+    return jnp.mean(across, axis=(1, 2, 3)) * jnp.sqrt(jnp.pi) / 2
 
 
 def locate(change: Float[Array, "n size size 3"]) -> Window:
@@ -38,7 +46,7 @@ def locate(change: Float[Array, "n size size 3"]) -> Window:
     Without a silhouette, it is the whole image. `change` is the image minus that of the empty sensor, both in [0, 1].
     """
     size = change.shape[1]
-    weight = shows(change)
+    weight = shows(change, jnp.maximum(THRESHOLD, DEVIATIONS * noise(change)))
     total = jnp.maximum(jnp.sum(weight, axis=(1, 2)), 1)
     place = (jnp.arange(size) + 0.5) / size - 0.5  # from the centre of the image
     of_columns, of_rows = jnp.sum(weight, axis=1) / total[:, None], jnp.sum(weight, axis=2) / total[:, None]
