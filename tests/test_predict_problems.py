@@ -227,8 +227,10 @@ print(len(done))
 """
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("count", "rounds"), [(4, 3), (60, 5)], ids=["4", "60"])
+@pytest.mark.parametrize(
+    ("count", "rounds"),
+    [pytest.param(4, 3, marks=pytest.mark.slow, id="4"), pytest.param(60, 5, marks=pytest.mark.long, id="60")],
+)
 def test_two_threads_predict_at_the_same_time(count, rounds):
     """With an eigenvalue decomposition of LAPACK in the program, both threads waited for ever."""
     run = subprocess.run(
