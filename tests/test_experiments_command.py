@@ -1,7 +1,9 @@
 """Presets, the effect of options on them, checks before any work, and the record of results. No experiment is run."""
 
 import dataclasses
+import os
 import re
+import subprocess
 import sys
 import warnings
 from pathlib import Path
@@ -443,3 +445,18 @@ def test_damage_stays_visible_when_another_part_is_written(evaluated):
     (evaluated / "other.md").write_bytes(b"flipped")
     evaluate.record(evaluated, "evaluation", INPUTS, [evaluated / "table.md"])
     assert "other.md is not the file" in evaluate.stale(evaluated, "other", {"dataset": INPUTS["dataset"]})
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the variable is of Linux's C library")
+@pytest.mark.parametrize(
+    ("given", "value"), [(None, "glibc.malloc.hugetlb=1"), ("glibc.malloc.hugetlb=0", "glibc.malloc.hugetlb=0")]
+)
+def test_a_command_has_large_pages_from_its_start_unless_the_user_chose(given, value):
+    command = "import sys; sys.argv[0] = '-m'; import experiments, os; print(*sys.argv[1:], os.getpid(), end=' ')"
+    read = "print(open('/proc/self/environ').read().split('GLIBC_TUNABLES=')[1].split(chr(0))[0])"
+    variables = {name: text for name, text in os.environ.items() if name != "GLIBC_TUNABLES"}
+    pipes = {"stdout": subprocess.PIPE, "text": True}
+    words = [sys.executable, "-W", "error", "-c", f"{command}; {read}", "--seed", "3"]
+    with subprocess.Popen(words, env=variables | ({"GLIBC_TUNABLES": given} if given else {}), **pipes) as process:
+        output, _ = process.communicate(timeout=60)
+    assert (process.returncode, output) == (0, f"--seed 3 {process.pid} {value}\n")
