@@ -2,6 +2,7 @@
 
     python -m benchmarks.shipped perturbed    # about 15 minutes on two CPU cores, 8 GB of memory
     python -m benchmarks.shipped perturbed --trained runs/perturbed/models/statespace    # another trained model
+    python -m benchmarks.shipped perturbed --noise 4 --blur 0.5    # the input images of a worse camera
 
 An experiment has few held-out objects, so its intervals are wide. This command draws new objects, and simulates and
 renders four trajectories of each, which stay in the work directory. The calibration error of few trajectories is above
@@ -13,6 +14,7 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal
 
+import cv2
 import numpy as np
 import tyro
 
@@ -58,6 +60,8 @@ class Args:
     objects: int = 1250  # number of objects. A fifth of them are for the baselines
     seed: int = 100  # seed of the objects and trajectories. The models were trained with the seed 2
     workdir: Path | None = None  # folder for the trajectories (default: runs/shipped-MODEL)
+    noise: float = 0.0  # standard deviation of the noise that is added to the input images (of 255)
+    blur: float = 0.0  # standard deviation of the Gaussian that blurs the input images before (pixels of 128)
 
 
 def collection(args: Args) -> dataset.Collection:
@@ -80,6 +84,17 @@ def columns(names: dict[str, str]) -> list[evaluation.Column]:
     return [evaluation.Column(heading, (metrics[name],)) for heading, name in names.items()]
 
 
+def degraded(images: np.ndarray, args: Args) -> np.ndarray:
+    """Blur images, uint8 `(n, h, w, 3)`, then add noise, as `args` says."""
+    rng = np.random.default_rng(args.seed)
+
+    def worse(image: np.ndarray) -> np.ndarray:
+        blurred = cv2.GaussianBlur(image.astype(np.float32), (0, 0), args.blur) if args.blur else image
+        return np.clip(np.rint(blurred + args.noise * rng.standard_normal(image.shape)), 0, 255).astype(np.uint8)
+
+    return np.stack([worse(image) for image in images])
+
+
 def if_calibrated(confidence: np.ndarray, *, draws: int = DRAWS, seed: int = 0) -> float:
     """Compute the mean calibration error that chance alone causes if the predicted probabilities are correct."""
     drawn = np.random.default_rng(seed).random((draws, len(confidence))) < confidence
@@ -90,6 +105,8 @@ def main(args: Args) -> str:
     """Test a model on new trajectories, and return a table of the main metrics and a table for sampled predictions."""
     if args.objects < 5:
         raise ValueError(f"--objects must be at least 5, got {args.objects}")
+    if args.noise < 0 or args.blur < 0:
+        raise ValueError(f"--noise and --blur must be >= 0, got {args.noise} and {args.blur}")
     sts.enable_compilation_cache()
     scenario = EXPERIMENTS[args.model].COLLECTION.scenario
     predictor = _predictor(args, scenario)
@@ -100,6 +117,9 @@ def main(args: Args) -> str:
     size = EXPERIMENTS[args.model].DEFAULT.image_size
     train, given = dataset.reduced(data.pairs(rows["train"]), size), data.pairs(rows["test"])
     test = dataset.reduced(given, size)
+    if args.noise or args.blur:
+        for images in (given.visual, given.tactile):
+            images[:, 0] = degraded(images[:, 0], args)
     judge = evaluation.scorer(scenario, train)
     items = evaluation.figures.one_of_each(test, dataset.class_names(made), SHOWN)
     scores = {title: judge(row, test) for title, row in evaluation.baselines(scenario, train, test).items()}
@@ -129,6 +149,7 @@ def main(args: Args) -> str:
         )
     summary = evaluation.summarise(scores, test, outcomes=scenario.outcomes)
     measured = "the shipped model" if args.trained is None else f"the model in {args.trained}"
+    measured += f", noise {args.noise:g}, blur {args.blur:g}" if args.noise or args.blur else ""
     title = f"{args.model}: {measured} on new objects (seed {args.seed})"
     main_table = evaluation.table(summary, title=title, notes=notes, columns=columns(COLUMNS))
     title = f"{args.model}: {NUM_SAMPLES} samples of each prediction"

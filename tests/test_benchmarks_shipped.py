@@ -25,6 +25,19 @@ def test_no_object_is_shared_with_the_training_of_the_model():
     assert not any(np.array_equal(one.vertices, two.vertices) for one in new for two in old)
 
 
+def test_worse_images_have_the_noise_and_the_blur_of_the_options():
+    line = np.zeros((2, 32, 32, 3), np.uint8)
+    line[:, :, 16] = 255
+    spread = shipped.degraded(line, shipped.Args("freefall", blur=1.5)).astype(float)
+    assert np.sum(spread[0, 8, :, 0] * (np.arange(32) - 16) ** 2) / np.sum(spread[0, 8, :, 0]) == pytest.approx(
+        2.25, rel=0.05
+    )
+    grey = np.full((4, 64, 64, 3), 128, np.uint8)
+    noisy = shipped.degraded(grey, shipped.Args("freefall", noise=4)).astype(float)
+    assert (noisy.mean(), noisy.std()) == pytest.approx((128, np.sqrt(16 + 1 / 12)), rel=0.01)  # 1/12: rounding
+    assert np.array_equal(shipped.degraded(grey, shipped.Args("freefall")), grey)
+
+
 @pytest.mark.slow
 def test_a_small_run_prints_the_metrics_of_every_input(tmp_path):
     args = shipped.Args("released", objects=10, workdir=tmp_path / "work")
