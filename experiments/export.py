@@ -22,20 +22,21 @@ from sts_jax.dataset import export
 class Args:
     """Options of the command line."""
 
-    dataset: Annotated[
-        Path, tyro.conf.Positional
-    ]  # folder of a finished dataset, or the work directory of an experiment
+    # folder or URL of a finished dataset, or the work directory of an experiment
+    dataset: Annotated[str, tyro.conf.Positional]
     to: Literal["lerobot", "oxt", "parquet", "png"]  # format
-    out: Path  # folder of the export
+    out: str  # folder of the export
     # `all` exports the trajectories with images of all frames, `ends` the first and last frames of all with images
     frames: Literal["all", "ends"] = "all"
 
 
 def main(args: Args) -> str:
     """Export a dataset, and state what the export has."""
+    if "://" in args.out:
+        raise ValueError(f"--out must be a folder of this computer, got {args.out}: copy the finished export there")
     with terminal.Bar() as bar:
         exported = export.FORMATS[args.to](
-            args.dataset, args.out, frames=args.frames, progress=lambda now: bar("frames", now.done, now.total)
+            args.dataset, Path(args.out), frames=args.frames, progress=lambda now: bar("frames", now.done, now.total)
         )
     line = f"{args.out}: {exported.frames} frames of {exported.trajectories} trajectories"
     if exported.left_out:

@@ -1,10 +1,22 @@
-"""Computation of the items of a batch on the devices of a mesh with explicit axes."""
+"""Processor cores of this process, and computation of a batch on the devices of a mesh with explicit axes."""
 
+import os
 from collections.abc import Callable
 from typing import Any
 
 import jax
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
+
+
+def cores() -> int:
+    """Number of processor cores that this process may use, which a cluster's scheduler may limit.
+
+    The environment variable `PYTHON_CPU_COUNT` replaces it, as in Python 3.13: containers with a quota show all cores.
+    """
+    given = os.environ.get("PYTHON_CPU_COUNT", "")
+    if given.isdecimal() and int(given) > 0:
+        return int(given)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def on_each_device(function: Callable[[Any, Any], Any], items: Any, shared: Any, axes: Any = 0) -> Any:

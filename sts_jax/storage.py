@@ -11,7 +11,7 @@ import os
 import platform
 import secrets
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, TypeVar
 
@@ -164,26 +164,35 @@ def read_arrays(path: Path, remedy: str) -> dict[str, np.ndarray]:
         raise DamagedFileError(f"{path} is damaged ({error}): {remedy}.") from error
 
 
-def claim(path: Path, content: dict, defaults: dict | None = None) -> None:
+def claim(path: Path, content: dict, defaults: dict | None = None, ignored: Sequence[str] = ()) -> None:
     """Record settings in a JSON file, or check that an existing file has the same settings.
 
     The check ensures that all results in a folder have the same settings. Tuples count as lists. A field that the file
-    lacks, because an older version wrote it, counts as equal to its default in `defaults`, from `default_fields`.
+    lacks, because an older version wrote it, counts as equal to its default in `defaults`, from `default_fields`. The
+    dotted names in `ignored` may differ.
     """
     content = json.loads(json.dumps(content))
     if not path.exists():
         write_json(path, content)
         return
     recorded = read_json(path, f"delete {path.parent}, or choose another folder")
-    changes = list(_differences(_filled(recorded, content, json.loads(json.dumps(defaults or {}))), content))
-    if changes:
-        old = ", ".join(f"{field or 'content'} = {value!r}" for field, value, _ in changes[:_SHOWN])
-        new = ", ".join(f"{field or 'content'} = {value!r}" for field, _, value in changes[:_SHOWN])
-        more = f" (also different: {', '.join(field for field, *_ in changes[_SHOWN:])})" if changes[_SHOWN:] else ""
+    old = _filled(recorded, content, json.loads(json.dumps(defaults or {})))
+    if changes := differences(old, content, ignored):
         raise ValueError(
-            f"{path} was made with {old}, but the current settings have {new}{more}: "
-            f"choose another folder, or delete {path.parent} to start again."
+            f"{path} was made with {changes}: choose another folder, or delete {path.parent} to start again."
         )
+
+
+_SHOWN = 3  # number of differing fields whose values a message contains
+
+
+def differences(old: object, new: object, ignored: Sequence[str] = ()) -> str:
+    """The fields of two contents of JSON types that differ, as a part of a message. Empty if all are equal."""
+    changes = [change for change in _differences(old, new) if change[0] not in ignored]
+    before = ", ".join(f"{field or 'content'} = {value!r}" for field, value, _ in changes[:_SHOWN])
+    now = ", ".join(f"{field or 'content'} = {value!r}" for field, _, value in changes[:_SHOWN])
+    more = f" (also different: {', '.join(field for field, *_ in changes[_SHOWN:])})" if changes[_SHOWN:] else ""
+    return f"{before}, but the current settings have {now}{more}" if changes else ""
 
 
 def default_fields(value: Any) -> dict:
@@ -204,9 +213,6 @@ def _filled(recorded: Any, content: Any, defaults: dict) -> Any:
     parts = {name: _filled(recorded[name], content.get(name), inner[name]) for name in inner if name in recorded}
     lacking = {name: value for name, value in defaults.items() if name in content and name not in {**recorded, **inner}}
     return recorded | parts | lacking
-
-
-_SHOWN = 3  # number of differing fields whose values a message contains
 
 
 def _differences(old: object, new: object, field: str = "") -> Iterator[tuple[str, object, object]]:
@@ -323,6 +329,9 @@ def verify(
             )
 
 
+_LOOK_S = 5.0  # longest wait for a lock that another process may only look at (s)
+
+
 @contextlib.contextmanager
 def lock(folder: Path, *, finished: bool = False, part: tuple[int, int] = (0, 1)) -> Iterator[None]:
     """Lock a folder for this process until the `with` block or the process ends. A missing folder is created.
@@ -347,7 +356,8 @@ def lock(folder: Path, *, finished: bool = False, part: tuple[int, int] = (0, 1)
         held.acquire()
         _owner(folder / name).write_text(this)
         for path in _other_locks(folder, name, count):
-            with filelock.FileLock(path, timeout=0):
+            # Other processes that start look at these locks for a moment, too.
+            with filelock.FileLock(path, timeout=_LOOK_S):
                 _unlock(path, keep=path.name == ".lock")
     except filelock.Timeout as error:
         taken = Path(error.lock_file)
@@ -395,6 +405,15 @@ def _other_locks(folder: Path, name: str, count: int) -> list[Path]:
     return [path for path in paths if path.name != name and not path.name.endswith(f"-of-{count}")]
 
 
+def _in_use(folder: Path) -> bool:
+    """Whether the lock of a whole folder is held."""
+    try:
+        with filelock.FileLock(folder / ".lock", timeout=0):
+            return False
+    except filelock.Timeout:
+        return True
+
+
 def delete_partial(folder: Path, prefix: str = "") -> None:
     """Delete unfinished files and folders, except in folders below that have a lock of their own.
 
@@ -404,7 +423,7 @@ def delete_partial(folder: Path, prefix: str = "") -> None:
     with contextlib.suppress(OSError):  # a folder of another user
         for path in list(folder.iterdir()):
             is_folder = path.is_dir() and not path.is_symlink()
-            if path.name.startswith(f".{prefix}") and path.suffix == ".partial":
+            if path.name.startswith(f".{prefix}") and path.suffix == ".partial" and not (is_folder and _in_use(path)):
                 shutil.rmtree(path, ignore_errors=True) if is_folder else path.unlink(missing_ok=True)
             elif is_folder and not any(path.glob(".lock*")):
                 delete_partial(path, prefix)
@@ -415,6 +434,9 @@ def flush_folder(folder: Path) -> None:
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.EBADF):  # some shared file systems cannot flush folders
+            raise
     finally:
         os.close(descriptor)
 

@@ -22,8 +22,8 @@ from native_dataset import EACH, FRAMES, PER_SHARD, RESOLUTION, SHARDS
 from PIL import Image
 
 from experiments import export as command
-from sts_jax import physics
-from sts_jax.dataset import export, split_objects
+from sts_jax import dataset, physics
+from sts_jax.dataset import export, remote, split_objects
 
 FORMATS = sorted(export.FORMATS)
 
@@ -264,6 +264,8 @@ def test_files_of_limited_size_and_small_batches_have_the_same_rows(native, tmp_
         monkeypatch.setattr(export, name, value)
     for name in ("parquet", "lerobot", "oxt"):
         export.FORMATS[name](folder, tmp_path / name)
+    monkeypatch.setattr(export, "_EPISODES", 5)  # 15 episodes: the last row group is full
+    export.to_lerobot(folder, tmp_path / "groups")
 
     def tables(name, inner):
         paths = sorted((tmp_path / name / inner).rglob("*.parquet"), key=lambda path: path.as_posix())
@@ -274,6 +276,16 @@ def test_files_of_limited_size_and_small_batches_have_the_same_rows(native, tmp_
     assert pa.concat_tables(parts) == pa.concat_tables(tables("parquet-whole", "data"))
     files = tables("lerobot", "data")
     assert pa.concat_tables(files) == pa.concat_tables(tables("lerobot-whole", "data"))
+    for name, groups in (("lerobot", 1), ("groups", 3)):
+        paths = sorted((tmp_path / name / "meta/episodes").rglob("*.parquet"), key=lambda path: path.as_posix())
+        assert len(paths) == groups  # each group is larger than a file may be
+        for path in paths:
+            place = "chunk-{:03d}/file-{:03d}.parquet"
+            for one in pq.read_table(path).to_pylist():
+                numbers = (one[f"meta/episodes/{kind}_index"] for kind in ("chunk", "file"))
+                assert path.as_posix().endswith(place.format(*numbers))
+    episodes = pa.concat_tables(tables("groups", "meta/episodes")).to_pylist()
+    assert [one["episode_index"] for one in episodes] == list(range(15))
     episodes = pa.concat_tables(tables("lerobot", "meta/episodes")).to_pylist()
     assert max(one["data/chunk_index"] for one in episodes) > 0
     for one in episodes:
@@ -307,8 +319,36 @@ def test_a_dataset_behind_a_url_is_exported(native, tmp_path, monkeypatch):
     monkeypatch.setattr("sts_jax.dataset.remote.cache_folder", lambda: tmp_path / "cache")
     files = fsspec.filesystem("memory")
     files.put(f"{native[0]}/*", "/export/falls/")
-    assert export.to_png("memory://export/falls", tmp_path / "out") == export.to_png(native[0], tmp_path / "local")
+    line = command.main(command.Args("memory://export/falls", "png", str(tmp_path / "out")))
+    assert line.startswith(f"{tmp_path / 'out'}: 90 frames")
+    export.to_png(native[0], tmp_path / "local")
+    with pytest.raises(ValueError, match="--out must be a folder of this computer, got memory://export/pngs"):
+        command.main(command.Args(str(native[0]), "png", "memory://export/pngs"))
     assert (tmp_path / "out/frames.csv").read_bytes() == (tmp_path / "local/frames.csv").read_bytes()
+
+
+def test_an_interrupted_download_goes_on(native, tmp_path, monkeypatch):
+    monkeypatch.setattr("sts_jax.dataset.remote.cache_folder", lambda: tmp_path / "cache")
+    files = fsspec.filesystem("memory")
+    files.put(f"{native[0]}/*", "/export/more/")
+    got, whole = [], remote.Remote.get
+
+    def get(self, folder, names):
+        if len(got) == 4:
+            raise ConnectionError("lost")
+        whole(self, folder, names)
+        got.extend(name for name in names if folder.parent.name == "datasets")
+
+    monkeypatch.setattr(remote.Remote, "get", get)
+    with pytest.raises(ConnectionError):
+        dataset.load("memory://export/more")
+    first = got.copy()
+    (folder,) = (tmp_path / "cache/datasets").iterdir()
+    (folder / first[1]).write_bytes(b"another file")
+    got.clear()
+    monkeypatch.setattr(remote.Remote, "get", lambda self, *args: (got.extend(args[1]), whole(self, *args)))
+    assert dataset.load("memory://export/more").identity == dataset.load(native[0]).identity
+    assert [name for name in first if name in got] == [first[1]]
 
 
 def _export_slowly(folder, target, name):
@@ -340,6 +380,11 @@ def test_an_export_has_the_data_card_with_the_licence_of_the_objects(native, tmp
     (tmp_path / "native" / "README.md").write_text("licence: CC BY 4.0, from elsewhere\n")
     export.to_png(tmp_path / "native", tmp_path / "out")
     assert (tmp_path / "out" / "README.md").read_text() == "licence: CC BY 4.0, from elsewhere\n"
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/README.md").write_text("of the work directory")
+    (tmp_path / "run/dataset").symlink_to(tmp_path / "native")
+    export.to_png(tmp_path / "run", tmp_path / "of-run")
+    assert (tmp_path / "of-run" / "README.md").read_text() == "licence: CC BY 4.0, from elsewhere\n"
 
 
 def test_another_export_or_folder_is_refused_and_the_same_export_is_kept(native, tmp_path):
@@ -368,7 +413,7 @@ def test_faults_are_named_before_anything_is_written(tmp_path, monkeypatch):
     with pytest.raises(OSError, match=r"shard-00002-of-00003\.array_record is not the file"):
         export.to_png(tmp_path / "native", tmp_path / "out", frames="ends")
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(ImportError, match=r"needs the package zarr: pip install 'sts_jax\[export\]'"):
+    with pytest.raises(ImportError, match=r"needs the package zarr: pip install zarr"):
         export.to_oxt(tmp_path / "native", tmp_path / "out")
     assert [path.name for path in tmp_path.iterdir()] == ["native"]
 
@@ -386,8 +431,8 @@ def test_a_full_disk_is_named_and_leaves_nothing(native, tmp_path, monkeypatch):
 
 
 def test_the_command_states_what_is_left_out(native, tmp_path):
-    line = command.main(command.Args(str(native[0]), "png", tmp_path / "out"))
+    line = command.main(command.Args(str(native[0]), "png", str(tmp_path / "out")))
     assert line.startswith(f"{tmp_path / 'out'}: 90 frames of 15 trajectories. 6 trajectories are left out")
-    assert command.main(command.Args(str(native[0]), "png", tmp_path / "ends", "ends")).endswith(
+    assert command.main(command.Args(str(native[0]), "png", str(tmp_path / "ends"), "ends")).endswith(
         "42 frames of 21 trajectories"
     )

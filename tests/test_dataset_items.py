@@ -1,15 +1,19 @@
 """Items of a dataset for data loaders, and the reader, the PyTorch dataset and the grain loader of docs/datasets.md."""
 
+import contextlib
 import json
+import os
 import pickle
 import re
+import resource
+import sys
 
 import numpy as np
 import pytest
 from extending_page import DOCS, blocks
 from native_dataset import EACH, FRAMES, PER_SHARD, RESOLUTION, SHARDS, write
 
-from sts_jax import dataset
+from sts_jax import dataset, storage
 
 
 @pytest.fixture(scope="module")
@@ -92,8 +96,44 @@ def test_items_have_the_images_and_fields_of_the_dataset(data, by):
         assert item["hidden.friction"] == data.hidden["friction"][trajectory]
         assert item["object"] == data.trajectory["body"][trajectory]
     assert seen == stored
+    items[0]["condition"][:] = items[0]["com"][:] = 99  # in place, as a loader may do
+    assert (items[0]["condition"] < 99).all()
+    assert (items[0]["com"] < 99).all()
     with pytest.raises(IndexError):
         items[len(items)]
+
+
+def test_few_shards_stay_open(data, monkeypatch):
+    opened = []
+    monkeypatch.setattr("sts_jax.dataset.loading._OPEN", 2)
+
+    def noted(self, shard, open_shard=dataset.Dataset._opened):
+        opened.append(shard)
+        return open_shard(self, shard)
+
+    monkeypatch.setattr(dataset.Dataset, "_opened", noted)
+    items = dataset.Items(data, data.rendered())
+    expected = [data.strip(i).visual for i in data.rendered().tolist()]
+    opened.clear()
+    for _ in range(2):
+        for i, truth in enumerate(expected):
+            np.testing.assert_array_equal(items[i]["visual"], truth)
+        assert len(items._opened) == 2
+    assert opened == [0, 1, 2, 0, 1, 2]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="counts open files")
+def test_too_many_open_files_are_no_damage(data):
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with contextlib.ExitStack() as files:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (max(map(int, os.listdir("/proc/self/fd"))) + 10, hard))
+        files.callback(resource.setrlimit, resource.RLIMIT_NOFILE, (soft, hard))
+        with contextlib.suppress(OSError):
+            while True:
+                files.enter_context(open(os.devnull))
+        with pytest.raises(OSError, match="Too many open files") as error:
+            data.strip(0)
+    assert not isinstance(error.value, storage.DamagedFileError)
 
 
 def test_items_without_images_are_refused(data):

@@ -153,7 +153,7 @@ def test_gravity_may_change_with_time_and_leaves_earlier_frames_bit_identical():
 
 
 def test_trajectories_do_not_depend_on_number_chunk_threads_and_progress_bar(drops, engine, capsys, monkeypatch):
-    monkeypatch.setattr("os.cpu_count", lambda: 5)
+    monkeypatch.setenv("PYTHON_CPU_COUNT", "5")
     chunk, text = {"mjx": (24, "simulate: compiling"), "mujoco": (1, "simulate")}[engine]
     again = simulate(jax.random.key(3), BODIES[:2], num=3, chunk=chunk, progress=True, engine=engine)
     out, err = capsys.readouterr()

@@ -8,8 +8,10 @@ import os
 import re
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
+import filelock
 import pytest
 
 from sts_jax import storage
@@ -232,11 +234,22 @@ def test_what_kills_have_left_is_deleted_with_the_lock_that_protects_it(tmp_path
         (tmp_path / name).write_text("half")
     (tmp_path / ".pair.3.partial").mkdir()
     (tmp_path / ".pair.3.partial/a.png").write_text("half")
-    with storage.lock(tmp_path / "models/one"):
+    with storage.lock(tmp_path / "models/one"), storage.lock(tmp_path / ".export.partial"):
         (tmp_path / "models/one/.e.json.2.partial").write_text("being written")
         with storage.lock(tmp_path):
             left = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.partial")}
-    assert left == {"models/one/.e.json.2.partial", "models/d.partial"}
+    assert left == {"models/one/.e.json.2.partial", "models/d.partial", ".export.partial"}
+    with storage.lock(tmp_path):
+        assert not (tmp_path / ".export.partial").exists()
+
+
+def test_processes_that_start_at_the_same_time_do_not_refuse_each_other(tmp_path):
+    looked_at = filelock.FileLock(tmp_path / ".lock", thread_local=False)
+    with storage.lock(tmp_path, part=(0, 3)), looked_at:
+        timer = threading.Timer(0.3, looked_at.release)  # the other process has looked whether the folder is in use
+        timer.start()
+        with storage.lock(tmp_path, part=(1, 3)):
+            timer.join()
 
 
 def test_a_finished_folder_is_read_on_a_read_only_disk(tmp_path, monkeypatch):

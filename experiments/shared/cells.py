@@ -5,7 +5,6 @@ out to the last one on its own predictions.
 """
 
 import dataclasses
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple, get_args
@@ -20,6 +19,7 @@ from experiments.shared.evaluate import SEED, identity, record, stale
 from experiments.shared.run import Job, collect, train_model
 from experiments.shared.terminal import Bar
 from sts_jax import dataset, evaluation, storage, training
+from sts_jax._devices import cores
 from sts_jax.training import Arrays, TrainConfig
 
 Scenario = Literal["freefall", "inclined", "perturbed"]
@@ -230,7 +230,7 @@ def _size(collection: dataset.Collection) -> float:
 
 
 def _slower() -> float:
-    return 2 / min(os.cpu_count() or 1, 4)
+    return 2 / min(cores(), 4)
 
 
 def scene(config: Config, name: str, sensor: sts.Sensor, workdir: Path) -> Scene:

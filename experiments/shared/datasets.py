@@ -1,5 +1,6 @@
 """The collection of a dataset with its duration, one progress bar, and a check of a dataset that was made elsewhere."""
 
+import contextlib
 import json
 import os
 import sys
@@ -13,7 +14,8 @@ from tqdm import tqdm
 
 import sts_jax as sts
 from experiments.shared.terminal import say
-from sts_jax import dataset
+from sts_jax import dataset, storage
+from sts_jax._devices import cores
 
 _EVERY_S = 10.0  # time between two lines of progress where standard error is not a terminal (s)
 _PROBED = 4  # trajectories that are simulated to measure the speed of this computer
@@ -36,6 +38,11 @@ def make(
     repair: bool = False,
 ) -> dataset.Collected:
     """Make what is missing of a dataset, as `dataset.collect` does, and show the progress."""
+    if process_index >= collection.num_shards:
+        say(
+            f"collect: nothing to do for process {process_index}, because there are {collection.num_shards} shards: "
+            "start fewer processes, or make smaller shards (--objects-per-shard)"
+        )
     with _Bar(collection, sensor, measure=cluster is None) as bar:
         collected = dataset.collect(
             collection,
@@ -56,23 +63,29 @@ def make(
     return collected
 
 
-def link(source: str, collection: dataset.Collection, folder: Path) -> None:
-    """Make a folder a link to a finished dataset of a collection, or to the local copy of one behind a URL."""
+def link(source: str, collection: dataset.Collection, sensor: sts.Sensor, folder: Path) -> dataset.Dataset:
+    """Make a folder a link to a finished dataset of a collection, or to the local copy of one behind a URL.
+
+    Only reads the dataset, so that several processes may use it at the same time.
+    """
     data = dataset.load(source)
-    expected, actual = json.loads(json.dumps(dataset.as_json(collection))), data.collection
-    fields = [name for name in expected if expected[name] != actual.get(name)]
-    if fields:
-        more = f" (also different: {', '.join(fields[1:])})" if fields[1:] else ""
-        raise ValueError(
-            f"the dataset {source} was collected with {fields[0]} = {actual.get(fields[0])!r}, but the configuration "
-            f"has {expected[fields[0]]!r}{more}: give the options with which it was collected, or another dataset"
-        )
     place = data.shards[0].parent.resolve()
+    new, constants = json.loads(json.dumps([dataset.as_json(collection), sensor.constants()]))
+    old = {name: data.collection.get(name) for name in new}
+    changes = storage.differences(old, new, dataset.PLACES) or storage.differences(
+        json.loads((place / "sensor.json").read_text()), constants
+    )
+    if changes:
+        raise ValueError(
+            f"the dataset {source} was collected with {changes}: give the options with which it was collected, or "
+            "another dataset"
+        )
     if folder.is_symlink() or folder.exists():
         if folder.resolve() != place:
             raise ValueError(f"{folder} is another dataset than {source}: choose another work directory, or delete it")
-        return
-    folder.symlink_to(place, target_is_directory=True)
+    else:
+        folder.symlink_to(place, target_is_directory=True)
+    return data
 
 
 def seconds(collection: dataset.Collection, sensor: sts.Sensor) -> tuple[float, float]:
@@ -99,7 +112,7 @@ def seconds(collection: dataset.Collection, sensor: sts.Sensor) -> tuple[float, 
         )[0].block_until_ready()
 
     draw(0)
-    workers = os.cpu_count() or 1
+    workers = cores()
     begin = time.monotonic()
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(draw, range(workers)))
@@ -151,8 +164,9 @@ class _Bar:
         time_needed = ""
         self._weights = (1.0, 1.0)  # workers finish both at the same time
         if self._measure:
-            self._weights = seconds(*self._given)
-            time_needed = f", about {duration(float(np.dot(self._weights, left)))} on this computer"
+            with contextlib.suppress(OSError, ValueError):  # an object that cannot be made is left out later
+                self._weights = seconds(*self._given)
+                time_needed = f", about {duration(float(np.dot(self._weights, left)))} on this computer"
         say(f"collect: {left[0]:,} trajectories and {left[1]:,} images{time_needed}")
         self._begun = float(np.dot(self._weights, progress[:2]))
         self._begun_s = self._said_s = time.monotonic()

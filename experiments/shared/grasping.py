@@ -2,7 +2,6 @@
 
 import concurrent.futures
 import dataclasses
-import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -17,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 import sts_jax as sts
 from sts_jax import scene, storage
+from sts_jax._devices import cores
 from sts_jax._ranges import COUNT, NUMBER, POSITIVE
 from sts_jax._ranges import check as check_ranges
 from sts_jax.scene.geometry import body_of
@@ -179,7 +179,7 @@ def simulate(lifts: Lifts, models: list[mujoco.MjModel], heights: np.ndarray) ->
         mujoco.mj_resetDataKeyframe(model, data, 0)
         mujoco.mj_getState(model, data, start, _STATE)
     control = np.stack([controls(height, lifts.shake) for height in heights])
-    workers = [mujoco.MjData(models[0]) for _ in range(os.cpu_count() or 1)]
+    workers = [mujoco.MjData(models[0]) for _ in range(cores())]
     return mujoco.rollout.rollout(models, workers, starts, control)[0]
 
 
@@ -220,7 +220,7 @@ def lift_object(lifts: Lifts, number: int) -> dict[str, np.ndarray]:
             "opening": np.asarray(data.qpos[1] + data.qpos[2], np.float32),
         }
 
-    with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+    with concurrent.futures.ThreadPoolExecutor(cores()) as pool:
         first = seen(moments[0])  # compiles
         rows = [first, *pool.map(seen, moments[1:])]
     drop = slid(states)

@@ -6,6 +6,7 @@ from sts_jax.dataset.collecting import Collected as Collected
 from sts_jax.dataset.collecting import Progress as Progress
 from sts_jax.dataset.collecting import collect as collect
 from sts_jax.dataset.collection import LEAST as LEAST
+from sts_jax.dataset.collection import PLACES as PLACES
 from sts_jax.dataset.collection import Collection as Collection
 from sts_jax.dataset.collection import as_json as as_json
 from sts_jax.dataset.collection import class_names as class_names

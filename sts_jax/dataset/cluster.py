@@ -29,7 +29,7 @@ def make_shards(
     try:
         import distributed
     except ImportError:
-        raise ImportError("a cluster needs the package distributed: pip install 'sts_jax[cluster]'") from None
+        raise ImportError("a cluster needs the package distributed: pip install distributed") from None
     place = target.url if isinstance(target, Remote) else str(target.absolute())
     try:
         client = distributed.Client(address)

@@ -16,7 +16,7 @@ import numpy as np
 from sts_jax._checked import in_32_bits
 from sts_jax.dataset import cluster, records
 from sts_jax.dataset.card import CARD, card
-from sts_jax.dataset.collection import Collection, as_json, split_objects
+from sts_jax.dataset.collection import PLACES, Collection, as_json, split_objects
 from sts_jax.dataset.remote import Remote, local_or_remote
 from sts_jax.dataset.shards import Simulated, planned, simulate_shard, write_shard
 from sts_jax.sensor import Sensor
@@ -167,7 +167,7 @@ def _collect(work: _Work, folder: Path) -> Collected:
 def _describe(work: _Work, folder: Path) -> Manifest | None:
     """Write the descriptions of the dataset, or check them. Return the manifest of the dataset, if it has one."""
     manifest = records.manifest_of(folder)
-    claim(folder / "collection.json", as_json(work.collection))
+    claim(folder / "collection.json", as_json(work.collection), ignored=PLACES)
     claim(folder / "sensor.json", work.sensor.constants())
     if not (folder / "split.json").exists():
         split = {name: [int(i) for i in part] for name, part in split_objects(work.collection).items()}

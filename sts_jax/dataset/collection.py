@@ -146,6 +146,10 @@ def split_objects(collection: Collection) -> dict[str, np.ndarray]:
     return {name: np.sort(part).astype(np.int64) for name, part in zip(PARTS, np.split(order, cuts), strict=True)}
 
 
+# Fields of a collection in JSON that may differ between computers. The files themselves have a checksum.
+PLACES = ("meshes.folder", "meshes.cache")
+
+
 def as_json(collection: Collection) -> dict:
     """The content of a dataset's `collection.json`."""
     content = dataclasses.asdict(collection)

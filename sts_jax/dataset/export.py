@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 
 from sts_jax import physics
+from sts_jax._devices import cores
 from sts_jax.dataset.card import CARD
 from sts_jax.dataset.collection import PARTS
 from sts_jax.dataset.items import frame_fields, trajectory_fields
@@ -143,7 +144,7 @@ FORMATS = {"lerobot": to_lerobot, "oxt": to_oxt, "parquet": to_parquet, "png": t
 def _need(package: str) -> None:
     """Raise an ImportError if a package is not installed."""
     if importlib.util.find_spec(package) is None:
-        raise ImportError(f"this export needs the package {package}: pip install 'sts_jax[export]'")
+        raise ImportError(f"this export needs the package {package}: pip install {package}")
 
 
 def _exported(
@@ -194,6 +195,7 @@ def _exported(
 def _planned(folder: Path, frames: Frames, progress: Callable[[Progress], None] | None) -> _Job:
     """Verify the dataset, and list what is exported."""
     data = load(folder, shards=[0])
+    folder = data.shards[0].parent  # a work directory has its dataset and the card in a folder below
     count = math.ceil(data.collection["num_objects"] / data.collection["objects_per_shard"])
     time, ends = data.trajectory["time"][0], _frames(data, frames)
     seconds = float(time[ends[-1]]) / max(len(ends) - 1, 1)
@@ -288,7 +290,7 @@ def _numbers(name: str, x: np.ndarray) -> list[str]:
 
 def _encoded(images: np.ndarray) -> list[bytes]:
     """Encode images (n, height, width, 3) as PNG files."""
-    with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+    with concurrent.futures.ThreadPoolExecutor(cores()) as pool:
         return list(pool.map(lambda image: cv2.imencode(".png", image[..., ::-1])[1].tobytes(), images))
 
 
@@ -324,11 +326,15 @@ class _ParquetFiles:
         self._tables: list[Any] = []
         self._size = self._pending = 0
 
+    def index_of(self, size: int) -> int:
+        """Index of the file that the first rows of the next episode go to, with `size` bytes of images."""
+        return self.index + (self._writer is None or self._size + size > _FILE)
+
     def add(self, table: Any, size: int, starts: bool) -> None:
         """Append rows with `size` bytes of images. A new file may begin if the rows start an episode."""
         import pyarrow.parquet as pq
 
-        if self._writer is None or (starts and self._size + size > _FILE):
+        if self._writer is None or (starts and self.index_of(size) > self.index):
             self.close()
             self.index += 1
             path = self._folder / self._name.format(index=self.index, **_numbered("", self.index))
@@ -414,9 +420,9 @@ def _lerobot(folder: Path, job: _Job) -> None:
             flush()
 
     def flush() -> None:
-        # The size counts the numbers of the statistics.
-        table = pa.Table.from_pylist([row | _numbered("meta/episodes/", max(episodes.index, 0)) for row in rows])
-        episodes.add(table, table.nbytes, True)
+        size = pa.Table.from_pylist(rows).nbytes  # of the numbers of the statistics
+        place = _numbered("meta/episodes/", episodes.index_of(size))
+        episodes.add(pa.Table.from_pylist([row | place for row in rows]), size, True)
         rows.clear()
 
     row: dict[str, Any] = {}
@@ -439,7 +445,8 @@ def _lerobot(folder: Path, job: _Job) -> None:
         index += count
         features = features or _features(values, images)
     finish(episode, row)
-    flush()
+    if rows:
+        flush()
     data.close()
     episodes.close()
     tasks = pa.table({"task_index": pa.array([0]), "task": [job.task]})

@@ -21,9 +21,10 @@ def trajectory_fields(data: Dataset, trajectory: int) -> dict[str, np.ndarray]:
     """Fields of a trajectory by name: outcome, condition, hidden properties, mass (kg), centre of mass (m), object."""
     return {
         "trajectory": np.array(trajectory),
-        **{name: data.trajectory[name][trajectory] for name in _TRAJECTORY},
-        **{f"hidden.{name}": values[trajectory] for name, values in data.hidden.items()},
-        **{name: data.solid[name][trajectory] for name in ("mass", "com")},
+        # copies, because a loader may change an item in place
+        **{name: data.trajectory[name][trajectory].copy() for name in _TRAJECTORY},
+        **{f"hidden.{name}": values[trajectory].copy() for name, values in data.hidden.items()},
+        **{name: data.solid[name][trajectory].copy() for name in ("mass", "com")},
         "object": data.trajectory["body"][trajectory].astype(np.int64),
     }
 

@@ -2,7 +2,6 @@
 
 import concurrent.futures
 import dataclasses
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -14,6 +13,7 @@ from jaxtyping import Float, Int
 
 from sts_jax import geometry, physics
 from sts_jax._checked import check_arrays, in_32_bits
+from sts_jax._devices import cores
 from sts_jax.dataset import records
 from sts_jax.dataset.measurement import Measurement, measured
 from sts_jax.dataset.remote import Remote, local_copy, local_or_remote
@@ -28,6 +28,8 @@ from sts_jax.storage import (
     read_json,
     verify,
 )
+
+_OPEN = 128  # shards that are kept open. Many systems allow 256 or 1,024 open files per process
 
 
 class Pairs(NamedTuple):
@@ -141,10 +143,9 @@ class Dataset:
         Args:
             rows: Int `(n,)`. Index i is the frame of `self.frames[i]`.
             opened: The shards that earlier calls with the same dictionary have opened, which makes small reads twice as
-                fast. New ones are added.
+                fast. New ones are added, and of more than 128 the oldest ones are closed.
         """
         height, width = self.collection["resolution"]
-        shards = {} if opened is None else opened
         out = records.Images(
             np.empty((len(rows), height, width, 3), np.uint8),
             np.empty((len(rows), height, width, 3), np.uint8),
@@ -153,16 +154,19 @@ class Dataset:
 
         def read(shard: int) -> None:
             here = np.flatnonzero(self.shard_of[rows] == shard)
-            if shard not in shards:
-                shards[shard] = self._opened(shard)
-            for whole, piece in zip(out, shards[shard].images(self.record_of[rows[here]]), strict=True):
+            file = (opened or {}).get(shard) or self._opened(shard)
+            if opened is not None:
+                opened[shard] = file
+                for oldest in list(opened)[:-_OPEN]:
+                    opened.pop(oldest, None)
+            for whole, piece in zip(out, file.images(self.record_of[rows[here]]), strict=True):
                 whole[here] = piece
 
         needed = np.unique(self.shard_of[rows]).tolist()
         if len(needed) == 1:  # threads would take longer than the reading
             read(needed[0])
         else:
-            with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+            with concurrent.futures.ThreadPoolExecutor(cores()) as pool:
                 list(pool.map(read, needed))
         return out
 

@@ -131,7 +131,9 @@ def manifest_of(folder: Path) -> Manifest | None:
                 "collect into another folder, or read this one with the version that wrote it."
             )
     manifest = read_manifest(folder, f"restore it, or collect into another folder than {folder}", _Facts)
-    if manifest is None and not any(folder.glob("shard-*.json")) and len(list(folder.glob("shard-*.npz"))) > 1:
+    several = any(folder.glob(".lock-*-of-*"))  # processes, of which each may be between the files of a shard
+    finished = manifest is not None or any(folder.glob("shard-*.json"))
+    if not finished and not several and len(list(folder.glob("shard-*.npz"))) > 1:
         # A process that is killed leaves at most one finished pair of files without a manifest.
         raise DamagedFileError(
             f"{folder / MANIFEST} is missing, but {folder} has shards: restore it, or collect into another folder."
@@ -168,6 +170,7 @@ class Shard:
         """Open a file that must contain `total` records. A truncated file may open without an error otherwise."""
         if not path.is_file():
             raise FileNotFoundError(f"{path} is missing: {remedy(path.parent)}.")
+        path.open("rb").close()  # its error, such as too many open files, would otherwise look like damage
         self._path, self._resolution, self._lock = path, resolution, threading.Lock()
         try:
             self._reader = ArrayRecordReader(str(path), READER_OPTIONS, file_reader_buffer_size=READER_BUFFER)

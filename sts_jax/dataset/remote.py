@@ -2,6 +2,7 @@
 
 import functools
 import os
+import secrets
 import tempfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -11,7 +12,7 @@ import fsspec
 
 from sts_jax.compilation import cache_folder
 from sts_jax.dataset.card import CARD
-from sts_jax.storage import MANIFEST, Manifest, digest, read_manifest, remedy
+from sts_jax.storage import MANIFEST, Manifest, digest, read_manifest, remedy, sha256
 
 Result = TypeVar("Result")
 
@@ -45,7 +46,7 @@ class Remote:
         """Download files into a local folder, each as a whole or not at all."""
         folder.mkdir(parents=True, exist_ok=True)
         for name in names:
-            partial = folder / f".{name}.{os.getpid()}.partial"
+            partial = folder / f".{name}.{os.getpid()}-{secrets.token_hex(4)}.partial"
             try:
                 call = functools.partial(self._system.get_file, f"{self._path}/{name}", str(partial))
                 self._do(f"read {name} from", call)
@@ -87,6 +88,12 @@ def local_or_remote(target: str | os.PathLike[str]) -> Path | Remote:
 def local_copy(remote: Remote) -> Path:
     """Download a finished dataset into the cache, and return its local folder. Files that are there already stay."""
     folder = cache_folder() / "datasets" / digest(remote.url)[:16]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OSError(
+            f"cannot keep a copy of {remote.url} in {folder} ({error}): set XDG_CACHE_HOME to a folder with room for it"
+        ) from error
     names = remote.names()
     if MANIFEST not in names:
         what = "the collection is not finished" if "collection.json" in names else "it is not a collected dataset"
@@ -97,8 +104,9 @@ def local_copy(remote: Remote) -> Path:
         remote.get(Path(temporary), [MANIFEST])
         after = read_manifest(Path(temporary), advice)
     assert after is not None
-    for name in after.files:
-        if before.files.get(name) != after.files[name] or not (folder / name).exists():
+    for name, checksum in after.files.items():
+        path = folder / name  # whole, but in no manifest, if an earlier download was interrupted
+        if not path.exists() or (before.files.get(name) != checksum and sha256(path) != checksum):
             remote.get(folder, [name])
     remote.get(folder, [name for name in (CARD, MANIFEST) if name in names])
     return folder

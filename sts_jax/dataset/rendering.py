@@ -4,7 +4,6 @@ import collections
 import concurrent.futures
 import functools
 import itertools
-import os
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -15,6 +14,7 @@ from jaxtyping import Array, Float, UInt8
 
 from sts_jax import geometry, objects, physics
 from sts_jax._checked import in_32_bits
+from sts_jax._devices import cores
 from sts_jax.dataset import records
 from sts_jax.dataset.collection import Collection, make_bodies
 from sts_jax.frame import sense
@@ -74,7 +74,7 @@ def render(
         kept = images[:1] if job.is_view else images
         return tuple(np.asarray(leaf)[: len(job.pose)] for leaf in kept)
 
-    done, todo, workers = 0, jobs(), os.cpu_count() or 1
+    done, todo, workers = 0, jobs(), cores()
     with concurrent.futures.ThreadPoolExecutor(workers) as pool:
         # A few jobs ahead: large images would fill the memory if the disk is slower than the rendering.
         pending = collections.deque(pool.submit(work, job) for job in itertools.islice(todo, 2 * workers))

@@ -1,7 +1,6 @@
 """Predictions without a trained model: the baselines, and the ceiling from re-rolls."""
 
 import concurrent.futures
-import os
 from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
@@ -11,6 +10,7 @@ from jaxtyping import PRNGKeyArray
 
 from sts_jax import dataset, physics
 from sts_jax._checked import in_32_bits
+from sts_jax._devices import cores
 from sts_jax.dataset import Pairs
 from sts_jax.evaluation import metrics
 from sts_jax.evaluation.predictions import Predicted, in_unit, outcome_of_pose, shares
@@ -245,7 +245,7 @@ def _render(
 
     shape = collection.resolution if same else (size, size)
     visual, tactile = (np.empty((len(owner), *shape, 3), np.uint8) for _ in range(2))
-    with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+    with concurrent.futures.ThreadPoolExecutor(cores()) as pool:
         for rows, parts in zip(jobs, pool.map(in_32_bits(work), jobs), strict=True):
             visual[rows], tactile[rows] = parts
     return visual, tactile

@@ -2,7 +2,6 @@
 
 import concurrent.futures
 import math
-import os
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -12,6 +11,7 @@ from jaxtyping import Float, Int
 
 from sts_jax import objects
 from sts_jax._checked import in_32_bits
+from sts_jax._devices import cores
 from sts_jax.objects.body import Body
 from sts_jax.physics import contact
 from sts_jax.physics.contact import Hull
@@ -93,7 +93,7 @@ def rigids(bodies: Sequence[Body], which: Int[np.ndarray, "n"], hidden: Hidden) 
 
     # A call uses one core of a CPU. The first call compiles.
     parts = [computed(rows) for rows in calls[:1]]
-    with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+    with concurrent.futures.ThreadPoolExecutor(cores()) as pool:
         parts += pool.map(in_32_bits(computed), calls[1:])
     return Rigid(*(np.concatenate(leaves).astype(np.float64) for leaves in zip(*parts, strict=True)))
 

@@ -3,7 +3,6 @@
 import concurrent.futures
 import contextlib
 import functools
-import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple, get_args
@@ -15,6 +14,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 from tqdm import tqdm
 
 from sts_jax._checked import check_key, in_32_bits
+from sts_jax._devices import cores
 from sts_jax.objects.body import Body, is_traced
 from sts_jax.physics.arguments import (
     check_arguments,
@@ -234,7 +234,7 @@ def _accepted(
     """Draw and simulate all trajectories, and draw failed ones again until none fails."""
     count, scenario = len(setup.which), setup.scenario
     nth = np.arange(count) % (count // len(setup.bodies))
-    prepare, workers = (in_mjx, WORKERS) if engine == "mjx" else (in_c, os.cpu_count() or 1)
+    prepare, workers = (in_mjx, WORKERS) if engine == "mjx" else (in_c, cores())
     shape = shapes(setup.bodies, scenario)
     attempt, pending = np.zeros(count, np.int32), np.arange(count)
     rows: dict[int, Rolled] = {}
