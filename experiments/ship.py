@@ -61,7 +61,13 @@ def ship(workdir: Path, name: str, calibration: Path | None = None) -> str:
 def _others(folder: Path, config: Path) -> dataset.Dataset:
     """Load a dataset, whose seed must differ from that of the work directory with the configuration `config`."""
     data = dataset.load(folder)
-    if config.exists() and storage.read_json(config, "")["collection"]["seed"] == data.collection["seed"]:
+    if not config.exists():
+        return data
+    trained = storage.read_json(config, "")["collection"]
+    scenario = {name: value for name, value in data.collection["scenario"].items() if name != "name"}
+    if changes := storage.differences(trained["scenario"], scenario):
+        raise ValueError(f"--calibration {folder}: the model has {changes}: give a dataset of the same scenario")
+    if trained["seed"] == data.collection["seed"]:
         raise ValueError(
             f"--calibration {folder} has the seed {data.collection['seed']} of the training objects, on which a model "
             "is too certain: give a dataset with another seed"

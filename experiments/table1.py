@@ -125,7 +125,7 @@ def main(config: Config, workdir: Path) -> None:
                 say(f"[{number}/{len(todo)}] {cell.name}: {time.monotonic() - start:.0f} s, {_minutes(rest)} left")
             jax.clear_caches()  # programs of all models together would exceed Linux' limit of maps (vm.max_map_count)
             following = todo[number] if number < len(todo) else None
-            if following is None or following[0] != cell[0]:  # a scenario of a seed is complete
+            if following is None or (following.scenario, following.seed) != (cell.scenario, cell.seed):
                 write(config, workdir, scenes, references)
         draw(config, workdir, sensor, scenes)
         print(ending(workdir))
@@ -156,7 +156,7 @@ def write(
     title = f"Table 1, {workdir.name}: the last frame from the first one, held out by {config.split}"
     texts = {
         "table1.md": claims.table(numbers, title=title, notes=notes(config)),
-        "claims.md": claims.verdicts(numbers),
+        "claims.md": claims.verdicts(numbers, equal_steps=config.training.steps is not None, split=config.split),
     }
     for file, text in texts.items():
         storage.write_bytes(workdir / file, text.encode())

@@ -79,6 +79,11 @@ class Predictor:
         self._names = config.names if isinstance(config, mvae.Config) else MODALITIES
         if isinstance(config, mvae.Config):
             for modality in config.modalities:
+                if modality.name in STREAMS and (modality.kind, modality.shape) != ("image", size):
+                    raise ValueError(
+                        f"{name}: the modality {modality.name!r} is {modality.kind} of shape {modality.shape}, but a "
+                        f"Predictor needs an image of shape {size}: give this modality another name"
+                    )
                 self._kinds.setdefault(modality.name, "image" if modality.kind == "image" else "vector")
                 self._shapes.setdefault(modality.name, modality.shape)
             # A vector without a scale was trained on its own numbers.

@@ -254,6 +254,18 @@ def test_a_ceiling_of_the_first_items_is_compared_with_the_constant_on_these(sco
     assert f'The metrics of "{evaluation.CEILING}" are over the first 2 trajectories.' in text
 
 
+def test_a_model_of_the_first_items_is_compared_with_the_baselines_on_these(scored):
+    test, scores = scored
+    part = {name: values[:4] for name, values in scores["model"].items()}
+    found = evaluation.summarise({**scores, "part": part}, test, metrics=OWN, num=50)["differences"]
+    alone = {name: {key: values[:4] for key, values in row.items()} for name, row in scores.items()}
+    expected = evaluation.summarise(alone, test.take(slice(4)), metrics=OWN, num=50)["differences"]["model"]
+    for base, cells in expected.items():
+        for name, cell in cells.items():
+            assert (found["part"][base][name] or {}).get("value") == (cell or {}).get("value"), (base, name)
+    assert found["part"] != found["model"]
+
+
 def test_the_full_table_has_every_predictor_and_the_differences(summary):
     lines = evaluation.full_table(summary, title="t", metrics=OWN).splitlines()
     complete, differences = [line.strip("| ").split(" | ") for line in lines if line.startswith("| predictor")]

@@ -4,6 +4,7 @@ import dataclasses
 import re
 from pathlib import Path
 
+import native_dataset
 import numpy as np
 import pytest
 
@@ -11,8 +12,9 @@ import sts_jax as sts
 from benchmarks import kills
 from experiments import collect, freefall, inclined, perturbed, released
 from experiments.shared import datasets, run
+from experiments.shared.config import Run
 from experiments.shared.terminal import on_one_line
-from sts_jax import dataset
+from sts_jax import dataset, evaluation
 
 SMALL = dataset.Collection(
     sts.physics.Freefall(frames=12), num_objects=4, num_per_object=2, num_full=1, objects_per_shard=2
@@ -81,7 +83,10 @@ def test_an_experiment_takes_a_finished_dataset_of_another_computer(folder, tmp_
     assert ran == 3 * [dataset.load(folder).identity]
     assert (tmp_path / "run" / "dataset").resolve() == folder
     other = dataclasses.replace(SMALL, num_per_object=3, seed=7)
-    with pytest.raises(ValueError, match=r"collected with num_per_object = 2, but the configuration has 3 \(also"):
+    message = (
+        r"collected with num_per_object = 2, seed = \d, but the current settings have num_per_object = 3, seed = 7"
+    )
+    with pytest.raises(ValueError, match=message):
         run.main(dataclasses.replace(config, collection=other), tmp_path / "other", only="train", source=source)
     dataset.collect(SMALL, sts.Sensor(), tmp_path / "again")
     with pytest.raises(ValueError, match="run/dataset is another dataset than"):
@@ -107,3 +112,19 @@ def test_random_kills_of_the_command_leave_the_same_bytes_and_nothing_else(tmp_p
     assert result.inside >= 2
     assert (result.different, result.left_over) == (0, 0)
     assert result.datasets >= 1
+
+
+@pytest.mark.parametrize("split", ["object", "trajectory"])
+def test_no_held_out_trajectory_is_in_the_training_of_the_state_space_model(tmp_path, monkeypatch, split):
+    native_dataset.write(tmp_path / "native")
+    data, given = dataset.load(tmp_path / "native"), []
+    monkeypatch.setattr(run, "jobs", lambda *args: given.append(args) or iter(()))
+    run.train(Run(perturbed.SMOKE, tmp_path, sts.Sensor(), split), data)
+    ((_, _, pairs, _, falls, _),) = given
+    test = evaluation.rows_of(data, split)["test"]
+    assert test.size
+    assert not set(test) & {*pairs.trajectory, *falls.trajectory}
+    assert set(falls.trajectory) - set(pairs.trajectory)  # also those without images
+    left = set(evaluation.rows_of(data, split)["train"]) - set(pairs.trajectory)
+    assert bool(left) == (split == "trajectory")  # they calibrate the model
+    assert not left & set(falls.trajectory)

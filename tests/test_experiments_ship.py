@@ -100,10 +100,14 @@ def test_the_copy_is_calibrated_on_another_dataset(models, tmp_path, monkeypatch
     for one, other in zip(jax.tree.leaves(got.calibration), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-4)
     assert np.ptp(got.calibration.variance) > 0.1
-    storage.write_json(workdir / "config.json", {"collection": {"seed": collection.seed}})
-    files = content(models / "falls")
-    with pytest.raises(ValueError, match=r"others has the seed 3 of the training objects.* with another seed"):
-        ship.ship(workdir, "falls", folder)
+    files, trained = content(models / "falls"), dataclasses.asdict(collection)
+    for change, message in (
+        ({}, r"others has the seed 3 of the training objects.* with another seed"),
+        ({"scenario": {**trained["scenario"], "frames": 99}}, r"others: the model has frames = 99, .* same scenario"),
+    ):
+        storage.write_json(workdir / "config.json", {"collection": trained | change})
+        with pytest.raises(ValueError, match=message):
+            ship.ship(workdir, "falls", folder)
     assert content(models / "falls") == files
 
 

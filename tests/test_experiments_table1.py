@@ -350,3 +350,21 @@ def test_shuffled_targets_give_no_skill(shuffled, tmp_path):
         assert abs(1 - found.value) < 0.1
     else:
         assert 1 - found.value > 0.5
+
+
+def test_the_table_is_written_after_each_seed_of_a_scenario(tmp_path, monkeypatch):
+    written = []
+    for name in ("scene", "references", "compute"):
+        monkeypatch.setattr(cells, name, lambda *_: None)
+    monkeypatch.setattr(table1, "write", lambda *_: written.append(1))
+    monkeypatch.setattr(table1, "draw", lambda *_: None)
+    monkeypatch.setattr(table1, "ending", lambda _: "")
+    table1.main(small(scenarios=("freefall",), seeds=(0, 1), models=("vae-visual",)), tmp_path)
+    assert len(written) == 2
+
+
+def test_the_claims_say_how_long_the_models_of_the_paper_are_trained():
+    one = claims.summarise(synthetic(levels()))
+    text = claims.verdicts([one], equal_steps=False, split="trajectory")
+    assert "with the same number of epochs, so one-step models make more steps, and batches" in text
+    assert "The validation trajectories are the training trajectories." in text

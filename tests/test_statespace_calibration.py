@@ -180,3 +180,9 @@ def test_a_new_checkpoint_drops_the_calibration(folder):
     training.save(folder, training.TrainState(model.state, nnx.State({}), None, jnp.int32(1)))
     assert training.load(folder).calibration is None
     assert not (folder / "calibration.json").exists()
+
+
+def test_items_with_only_the_true_state_have_the_values_of_no_input():
+    found = predict.of_items(STATE, NUMBERS, {"state": jnp.ones(3, bool)})
+    for values, numbers in zip(found, NUMBERS, strict=True):
+        np.testing.assert_array_equal(values, np.repeat(numbers[0], 3))

@@ -10,7 +10,7 @@ from jaxtyping import TypeCheckError
 from recorded_session import SQUARE, drawn
 
 import sts_jax as sts
-from sts_jax import dataset, physics, training
+from sts_jax import dataset, mvae, physics, training
 
 
 def arrays(*, further=True):
@@ -174,3 +174,33 @@ def test_a_one_step_model_gets_the_poses_and_conditions_of_all_frames():
     assert (final.stride, final.condition, final.inputs, same) == (0, 3, ("tactile",), view)
     with pytest.raises(ValueError, match="the samples of `inputs` have the shapes"):
         training.arrays.check(final, arrays)
+
+
+PICTURE = mvae.Config((mvae.Modality("v", "vector", (3,)), mvae.Modality("i", "image", (32, 32, 1))))
+VECTOR, IMAGE = np.zeros((2, 3), np.float32), np.ones((2, 32, 32, 1), np.float32)
+UNKNOWN = np.array([[0, 0, 0], [0, np.nan, 0]], np.float32)
+
+
+@pytest.mark.parametrize(
+    ("vector", "image", "message"),
+    [
+        (VECTOR.astype(np.uint8), IMAGE, "the array 'v' of `inputs` is uint8, which counts as an image"),
+        (
+            VECTOR,
+            255 * IMAGE,
+            "the array 'i' of `inputs` has values from 255 to 255, but float images",
+        ),
+        (UNKNOWN, IMAGE, "the array 'v' of `inputs` has values that are not finite: mask"),
+    ],
+)
+def test_values_that_a_loss_takes_for_others_are_refused(vector, image, message):
+    good, bad = {"v": VECTOR, "i": IMAGE}, {"v": vector, "i": image}
+    with pytest.raises(ValueError, match=message):
+        training.arrays.check(PICTURE, training.Arrays(bad, good))
+    with pytest.raises(ValueError, match=message.replace("inputs", "targets")):
+        training.arrays.check(PICTURE, training.Arrays(good, bad))
+
+
+def test_masked_samples_may_have_any_value():
+    mask, values = {"v": np.array([True, False])}, {"v": UNKNOWN, "i": (255 * IMAGE).astype(np.uint8)}
+    training.arrays.check(PICTURE, training.Arrays(values, values, present=mask, target_present=mask))

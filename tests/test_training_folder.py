@@ -262,6 +262,16 @@ def test_a_blank_written_after_the_training_is_listed(tmp_path):
         np.testing.assert_array_equal(training.load_blank(tmp_path)[1], image)
 
 
+def test_the_blank_of_a_trained_model_does_not_change(tmp_path, folder):
+    for image in (IMAGE + 1, IMAGE):
+        training.save_blank(tmp_path, image, image)
+        np.testing.assert_array_equal(training.load_blank(tmp_path)[0], image)
+    training.save_blank(folder, IMAGE, IMAGE)
+    with pytest.raises(ValueError, match="was trained with another empty sensor: choose another folder"):
+        training.save_blank(folder, IMAGE + 1, IMAGE)
+    np.testing.assert_array_equal(training.load_blank(folder)[0], IMAGE)
+
+
 def test_a_config_of_another_version_is_named(folder):
     path = folder / "config.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"model": {"modalities": [], "colour": 1}}))

@@ -191,8 +191,8 @@ def test_another_validation_set_or_none_is_refused_in_the_same_folder(finished):
 
 def test_a_validation_loss_that_is_not_finite_ends_the_run(tmp_path):
     data = arrays(4)
-    bad = training.Arrays({name: x * np.nan for name, x in data.inputs.items()}, data.targets)
-    with pytest.raises(FloatingPointError, match="the validation loss is nan at step 2"):
+    bad = training.Arrays({name: x * np.float32(1e38) for name, x in data.inputs.items()}, data.targets)
+    with pytest.raises(FloatingPointError, match=r"the validation loss is (nan|inf) at step 2"):
         train(tmp_path, validation=bad)
 
 
@@ -210,3 +210,16 @@ def test_a_folder_of_an_older_version_lacks_new_fields_that_have_their_defaults(
     train(tmp_path, preprocessing=view)
     with pytest.raises(ValueError, match=r"preprocessing\.stride = None, .* settings have .*stride = 2, "):
         train(tmp_path, preprocessing=view | {"stride": 2, "period": 0.1})
+
+
+def test_a_loss_of_ones_own_is_scored_as_the_usual_one(finished, tmp_path):
+    modes, usual = set(), training.learner(SMALL).loss
+
+    def loss(*args, training=True):
+        modes.add(training)
+        return usual(*args, training=training)
+
+    train(tmp_path, loss=loss)
+    assert modes == {True, False}
+    for one, other in zip(training.records(tmp_path), training.records(finished[0]), strict=True):
+        assert one.get("validation") == other.get("validation")

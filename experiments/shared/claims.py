@@ -378,8 +378,10 @@ def _details(one: Summary) -> list[str]:
     ]
 
 
-def verdicts(every: Sequence[Summary]) -> str:
+def verdicts(every: Sequence[Summary], *, equal_steps: bool = True, split: str = "object") -> str:
     """`claims.md`: a sentence for each claim, scenario and family of models, and all differences."""
+    steps = "number of gradient steps" if equal_steps else "number of epochs, so one-step models make more steps,"
+    validation = "" if split == "object" else " The validation trajectories are the training trajectories."
     text = [
         "# The paper's two claims",
         "",
@@ -390,8 +392,8 @@ def verdicts(every: Sequence[Summary]) -> str:
         f"interval from a hierarchical bootstrap: each of {DRAWS} samples draws the held-out objects, with all their "
         "trajectories, and independently of them the seeds, both with replacement. A claim holds if the intervals of "
         "all its differences are below 0. It does not hold if that of one of them is above 0. Otherwise it is "
-        "undecided. The compared models were trained on the same trajectories, with the same number of gradient steps "
-        "and batches of the same size.",
+        f"undecided. The compared models were trained on the same trajectories, with the same {steps} and batches of "
+        f"the same size.{validation}",
         "",
     ]
     for one in every:

@@ -23,6 +23,7 @@ from sts_jax.training import TrainConfig
 Stage = Literal["collect", "train", "evaluate"]
 Skin = Literal["hazy", "clear"]
 Preset = TypeVar("Preset")  # type of a configuration
+_CALIBRATING = 10  # of the training trajectories of a split by trajectory, every 10th calibrates the state-space model
 # Fields of the configuration that have no effect on the training of each kind of models
 WITHOUT_EFFECT = {
     "statespace": ("training", "steps", "targets", "encode_condition", "prior"),
@@ -205,11 +206,15 @@ def main(
     """
     check(config, own)
     with storage.lock(workdir, finished=True):
-        storage.claim(workdir / "config.json", dataclasses.asdict(config), storage.default_fields(config))
+        places = [f"collection.{name}" for name in dataset.PLACES]
+        storage.claim(workdir / "config.json", dataclasses.asdict(config), storage.default_fields(config), places)
         folder = workdir / "dataset"
         if source is not None:
-            link(source, config.collection, folder)
-        data = collect(config.collection, sensor(skin), folder) if only in (None, "collect") else dataset.load(folder)
+            data = link(source, config.collection, sensor(skin), folder)
+        elif only in (None, "collect"):
+            data = collect(config.collection, sensor(skin), folder)
+        else:
+            data = dataset.load(folder)
         if only == "collect":
             return
         for split in config.splits:
@@ -273,22 +278,28 @@ def jobs(
 def train(run: Run, data: dataset.Dataset, own: Extensions = NONE) -> None:
     """Train the models of one split, and show the progress. The state-space model is calibrated afterwards."""
     config, rows = run.config, evaluation.rows_of(data, run.split)
-    state = config.model == "statespace"
+    state, falls = config.model == "statespace", None
+    train, validation = rows["train"], rows["validation"]
+    if state and run.split == "trajectory":  # in which the validation part is the training part
+        validation = train[::_CALIBRATING]
+        train = np.setdiff1d(train, validation)
+    if state:  # also those without images, but none that is held out
+        falls = np.setdiff1d(data.members("train", rendered=False), np.union1d(rows["test"], validation))
     # The trajectories are passed without a variable of their own, so that `jobs` can free their memory.
     for job in jobs(
         config,
         run.sensor,
-        data.pairs(rows["train"], measurements=own.measurements),
+        data.pairs(train, measurements=own.measurements),
         data.views("train") if state else None,
-        data.ends(data.members("train", rendered=False)) if state else None,
+        None if falls is None else data.ends(falls),
         own.measurements,
     ):
         folder = run.folder(job.name)
         training.claim_split(folder, rows)
         train_model(job, folder, config.targets, own)
         if isinstance(job.model, statespace.Config):
-            validation, scenario = data.pairs(rows["validation"]), config.collection.scenario
-            arrays = training.state_arrays(validation, job.model, scenario, job.preprocessing, job.empty)
+            pairs, scenario = data.pairs(validation), config.collection.scenario
+            arrays = training.state_arrays(pairs, job.model, scenario, job.preprocessing, job.empty)
             training.calibrate(folder, arrays)
 
 

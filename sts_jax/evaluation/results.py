@@ -132,22 +132,29 @@ def summarise(
         )
     items, names = len(test.object), {int(outcome): outcome.name.lower() for outcome in outcomes}
     scored = {name: len(next(iter(of_predictor.values()), test.object)) for name, of_predictor in scores.items()}
+    # Baselines are compared with a model on the items for which the model was scored.
+    counts = {scored[name] for name in scores if name not in (*BASELINES, *CEILINGS)}
+    every = list(scored.items())
+    every += [(base, count) for base in BASELINES for count in sorted(counts - {scored[base]})]
     statistics = [
-        [_statistic(metric, of_predictor, scores[CONSTANT], test.take(slice(scored[name]))) for metric in metrics]
-        for name, of_predictor in scores.items()
+        [
+            _statistic(metric, _first(scores[name], count), scores[CONSTANT], test.take(slice(count)))
+            for metric in metrics
+        ]
+        for name, count in every
     ]
 
     def numbers(weight: np.ndarray) -> np.ndarray:
         """All metrics, `(predictors, metrics)`, for weights of the items. NaN if a predictor lacks the metric."""
         rows = [
             [np.nan if statistic is None else statistic(weight[:count]) for statistic in row]
-            for row, count in zip(statistics, scored.values(), strict=True)
+            for row, (_, count) in zip(statistics, every, strict=True)
         ]
         return np.array(rows)
 
     value = numbers(np.ones(items))
     draws = bootstrap(test.object, numbers, num=num, seed=seed)
-    for i, count in enumerate(scored.values()):
+    for i, (_, count) in enumerate(every):
         first = test.take(slice(count))
         for k, metric in enumerate(metrics):
             if statistics[i][k] is not None:
@@ -159,7 +166,7 @@ def summarise(
         return {key: cell(values[k], sample[:, k]) for k, key in enumerate(keys)}
 
     rows = list(scores)
-    reference = {name: rows.index(name) for name in BASELINES}
+    place = {one: i for i, one in enumerate(every)}
     return {
         "items": items,
         "objects": len(np.unique(test.object)),
@@ -167,11 +174,19 @@ def summarise(
         "scored": scored,
         "predictors": {name: cells(value[i], draws[:, i]) for i, name in enumerate(rows)},
         "differences": {
-            name: {base: cells(value[i] - value[j], draws[:, i] - draws[:, j]) for base, j in reference.items()}
+            name: {
+                base: cells(value[i] - value[j], draws[:, i] - draws[:, j])
+                for base in BASELINES
+                for j in [place[base, scored[name]]]
+            }
             for i, name in enumerate(rows)
-            if name not in (*reference, *CEILINGS)
+            if name not in (*BASELINES, *CEILINGS)
         },
     }
+
+
+def _first(scores: Scores, count: int) -> Scores:
+    return {name: values[:count] for name, values in scores.items()}
 
 
 def _statistic(metric: Metric, scores: Scores, constant: Scores, test: Pairs) -> Callable[[np.ndarray], float] | None:

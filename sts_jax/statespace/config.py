@@ -50,7 +50,7 @@ class Config:
     canvas_side: float = 0.165  # m, side of the square parallel to the pad that the canvas covers
     weights: LossWeights = LossWeights()  # of the terms of the loss
     # True: the decoder predicts the outline of the imprint in the tactile image, so that samples have sharp imprints.
-    # False: it predicts only a mean tactile image, as in the models that come with the library
+    # False: it predicts only a mean tactile image, as in the models of the library other than freefall's
     imprints: bool = False
     # channels of a network that adjusts an imprint to its outline in a sample, which `imprints` must predict. 0: none
     shading: int = 0

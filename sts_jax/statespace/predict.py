@@ -45,6 +45,7 @@ def of_items(config: Config, calibration: Calibration, present: dict[str, Bool[A
     """
     names = enumerate(config.inputs)
     subset = jnp.asarray(sum(2**i * present[name].astype(int) for i, name in names if name in present))
+    subset = jnp.broadcast_to(subset, len(next(iter(present.values()))))
     corrected_as = jnp.where(present["state"], 0, subset) if "state" in present else subset
     density = Calibration(*(x[corrected_as] for x in calibration))
     return density._replace(contrast=calibration.contrast[subset])

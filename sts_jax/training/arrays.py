@@ -132,6 +132,21 @@ def order(seed: int, samples: int, batch_size: int, start: int, stop: int) -> It
         yield np.array([permutations[e][p] for e, p in zip(epoch, place, strict=True)])
 
 
+def _check_values(what: str, x: Any, mask: np.ndarray | None) -> None:
+    """Raise a ValueError if an array has numbers that a loss takes for others. Masked samples do not count."""
+    if x.dtype == np.uint8:
+        if len(x.shape) < 4:
+            raise ValueError(f"{what} is uint8, which counts as an image and is divided by 255: give float32")
+        return
+    if not np.issubdtype(x.dtype, np.floating) or not len(x):
+        return
+    x = np.asarray(x) if mask is None else np.asarray(x)[mask]
+    if not np.isfinite(x).all():
+        raise ValueError(f"{what} has values that are not finite: mask these samples, or leave them out")
+    if x.ndim == 4 and x.size and (x.min() < 0 or x.max() > 1):
+        raise ValueError(f"{what} has values from {x.min():g} to {x.max():g}, but float images must be in [0, 1]")
+
+
 def check(model: Config, arrays: Arrays, absent: tuple[str, ...] = ()) -> None:
     """Raise a ValueError if a training set does not fit a model."""
     if isinstance(model, mvae.Config):
@@ -153,6 +168,9 @@ def check(model: Config, arrays: Arrays, absent: tuple[str, ...] = ()) -> None:
         raise ValueError(f"`outcome` has the index {highest}, but the model has {model.outcomes} outcomes")
     if not set(arrays.present) <= set(inputs):
         raise ValueError(f"`present` has masks for {list(arrays.present)}, but the inputs are {list(inputs)}")
+    for kind, masks in (("inputs", arrays.present), ("targets", arrays.target_present)):
+        for name, x in getattr(arrays, kind).items():
+            _check_values(f"the array {name!r} of `{kind}`", x, masks.get(name))
     width = 0 if arrays.condition is None else arrays.condition.shape[-1]
     if width != model.condition:
         raise ValueError(f"`condition` has width {width}, but the model has condition={model.condition}")

@@ -309,15 +309,28 @@ def _logged(folder: Path, listed: storage.Manifest, *, whole: bool = False) -> b
 def save_blank(
     folder: Path, visual: UInt8[Array | np.ndarray, "h w 3"], tactile: UInt8[Array | np.ndarray, "h w 3"]
 ) -> None:
-    """Write the images of the empty sensor to the folder of a model. An existing file is not changed."""
+    """Write the images of the empty sensor to the folder of a model. Those of a trained model cannot change."""
     if manifest(folder / BEST) is not None:
         save_blank(folder / BEST, visual, tactile)
     path, listed = folder / BLANK, manifest(folder)
+    images = {"visual": np.asarray(visual), "tactile": np.asarray(tactile)}
     new = not path.exists()
-    if new:
-        storage.write_arrays(path, {"visual": np.asarray(visual), "tactile": np.asarray(tactile)})
+    if not new and listed is not None and listed.facts["step"] is not None:
+        if not all(map(np.array_equal, load_blank(folder), images.values())):
+            raise ValueError(f"{folder} was trained with another empty sensor: choose another folder, or delete it")
+    elif new or not _has(path, images):
+        storage.write_arrays(path, images)
+        new = True
     if listed is not None and (new or BLANK not in listed.files):
         storage.write_manifest(folder, {**listed.files, BLANK: storage.sha256(path)}, listed.facts)
+
+
+def _has(path: Path, images: Mapping[str, np.ndarray]) -> bool:
+    """Whether a file has these arrays, and is not damaged."""
+    with contextlib.suppress(OSError, KeyError):
+        old = storage.read_arrays(path, "")
+        return all(np.array_equal(old[name], image) for name, image in images.items())
+    return False
 
 
 def load_blank(folder: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -6,6 +6,7 @@ The loop is a Python loop over one compiled step, because convolutions in `lax.s
 import collections
 import concurrent.futures
 import functools
+import inspect
 import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -241,8 +242,8 @@ def train(
             those in the subset (`own`).
         preprocessing: JSON values that describe how images and vectors were made, such as `dataclasses.asdict(p)` of a
             `Preprocessing` p. They are stored in `config.json`.
-        loss: Replaces the loss from `training.learner`, also for `validation`. `targets` and `absent` are not passed to
-            it.
+        loss: Replaces the loss from `training.learner`, also for `validation`: with `training=False`, as that loss has
+            it, if it has this argument. `targets` and `absent` are not passed to it.
         optimiser: Replaces the optimiser from `training.optimiser` and its fields of `config`.
         notes: JSON values that name the given loss and optimiser, stored in `config.json`. A resumed training must have
             the same notes, because the functions themselves cannot be compared.
@@ -263,7 +264,9 @@ def train(
     task = learner(model, targets=targets, absent=absent)
     task.check(arrays)
     if loss is not None:
-        task = task._replace(loss=loss, score=loss)
+        can_score = "training" in inspect.signature(loss).parameters
+        score: Any = functools.partial(loss, training=False) if can_score else loss  # type: ignore[call-arg]
+        task = task._replace(loss=loss, score=score)
     settings: dict[str, Any] = {
         "kind": next(name for name, kind in KINDS.items() if isinstance(model, kind.Config)),
         "model": asdict(model),
