@@ -467,3 +467,62 @@ def test_a_mutated_file_is_read_or_named(tmp_path, name):
                 named.append(path.name in str(error))
         named += [path.name in str(warning.message) for warning in caught]
     assert all(named)
+
+
+PAINT = np.where(CORNERS[:, 2:] > 0, RED, BLUE)  # red above blue
+
+
+@pytest.mark.parametrize("kind", ["uint8", "uint16", "float32"])
+@pytest.mark.parametrize("materials", [None, [{}], [{"pbrMetallicRoughness": {"baseColorFactor": [1, 0.5, 1, 1]}}]])
+def test_colours_of_vertices_of_gltf_are_read_with_and_without_a_material(tmp_path, kind, materials):
+    whole = 1 if kind == "float32" else np.iinfo(kind).max
+    colors = np.concatenate([PAINT, np.ones((36, 1))], axis=1) * [0.25, 1, 0.5, 1] * whole
+    data = [
+        CORNERS.astype("<f4").tobytes(),
+        np.round(colors).astype(kind).tobytes() if whole > 1 else colors.astype("<f4").tobytes(),
+    ]
+    primitive = {"attributes": {"POSITION": 0, "COLOR_0": 1}} | ({} if materials is None else {"material": 0})
+    types = {"uint8": 5121, "uint16": 5123, "float32": 5126}
+    path = gltf(
+        tmp_path,
+        meshes=[{"primitives": [primitive]}],
+        materials=materials or [],
+        textures=[],
+        images=[],
+        buffers=[
+            {"uri": f"data:;base64,{base64.b64encode(b''.join(data)).decode()}", "byteLength": sum(map(len, data))}
+        ],
+        bufferViews=[
+            {"buffer": 0, "byteOffset": 0, "byteLength": len(data[0])},
+            {"buffer": 0, "byteOffset": len(data[0]), "byteLength": len(data[1])},
+        ],
+        accessors=[
+            {"bufferView": 0, "componentType": 5126, "count": 36, "type": "VEC3"},
+            {"bufferView": 1, "componentType": types[kind], "normalized": whole > 1, "count": 36, "type": "VEC4"},
+        ],
+    )
+    color, corners = seen(objects.load(path, strict=True))
+    factor = [1, 0.5, 1] if materials and materials[0] else [1, 1, 1]
+    expected = np.where(corners[..., 2:] > 0, RED, BLUE) * [0.25, 1, 0.5] * factor  # linear, as in the file
+    np.testing.assert_allclose(color, expected, atol=0.003)
+
+
+def test_colours_of_vertices_count_beside_texture_coordinates_without_an_image(tmp_path):
+    rows = [f"v {x} {y} {z} {r} {g} {b}" for (x, y, z), (r, g, b) in zip(CORNERS, PAINT, strict=True)]
+    (tmp_path / "box.mtl").write_text("newmtl skin\nKd 0.1 0.1 0.1\n")
+    (tmp_path / "box.obj").write_text("\n".join(obj().splitlines()[:2] + rows + obj().splitlines()[38:]))
+    assert is_red_above_blue(objects.load(tmp_path / "box.obj", strict=True))
+    head = "ply\nformat ascii 1.0\nelement vertex 36\n" + "".join(f"property float {name}\n" for name in "xyzst")
+    head += "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
+    head += "element face 12\nproperty list uchar int vertex_indices\nend_header\n"
+    rows = [" ".join(map(str, [*p, *uv, *(255 * c).astype(int)])) for p, uv, c in zip(CORNERS, UV, PAINT, strict=True)]
+    rows += [f"3 {i} {i + 1} {i + 2}" for i in range(0, 36, 3)]
+    (tmp_path / "box.ply").write_text(head + "\n".join(rows) + "\n")
+    assert is_red_above_blue(objects.load(tmp_path / "box.ply", strict=True))
+
+
+def test_points_without_faces_are_named(tmp_path):
+    head = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+    (tmp_path / "points.ply").write_text(head + "end_header\n0 0 0\n")
+    with pytest.raises(ValueError, match=r"points\.ply: .*it has points, but no list of faces"):
+        objects.load(tmp_path / "points.ply")

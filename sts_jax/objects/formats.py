@@ -93,6 +93,8 @@ def _loaded(content: Path | bytes, kind: str | None, resolver: Any) -> list[trim
     """Read a file or its content with trimesh."""
     source = io.BytesIO(content) if isinstance(content, bytes) else content
     scene = trimesh.load_scene(source, file_type=kind, process=False, resolver=resolver)
+    for mesh in scene.geometry.values():  # the copies of `dump` lose the attributes of a texture
+        mesh.vertex_attributes.update(getattr(mesh.visual, "vertex_attributes", {}))
     return [piece for piece in scene.dump() if isinstance(piece, trimesh.Trimesh) and len(piece.faces)]
 
 
@@ -235,7 +237,8 @@ def _obj(data: bytes, files: Files) -> list[trimesh.Trimesh]:
             if bare.image is not None and not has_texels:
                 files.problems.append(f"faces of the material {_name(name)} have no texture coordinates for its image")
             material = SimpleMaterial(pictures[bare.image], np.full(3, PLAIN) if bare.color is None else bare.color)
-            visual = trimesh.visual.TextureVisuals(uv, material)
+            if painted is None or pictures[bare.image] is not None:  # an image wins over colours of the vertices
+                visual = trimesh.visual.TextureVisuals(uv, material)
         colors = painted[vertex] if painted is not None and visual is None else None
         pieces.append(
             trimesh.Trimesh(place[vertex, :3], index.reshape(-1, 3), vertex_colors=colors, visual=visual, process=False)
@@ -312,7 +315,11 @@ def _ply(data: bytes, files: Files) -> list[trimesh.Trimesh]:
     pieces = _loaded(cut_ply(bare + end + body), "ply", files)
     names = [] if files.plain else re.findall(_TEXTURE, head)
     picture = files.image(names[0]) if names else None
-    for piece in pieces if picture is not None else []:
+    for piece in pieces:
+        if picture is None:
+            if (painted := piece.vertex_attributes.get("color")) is not None:  # also beside texture coordinates
+                piece.visual = trimesh.visual.ColorVisuals(piece, vertex_colors=painted)
+            continue
         if not isinstance(piece.visual, trimesh.visual.TextureVisuals):
             files.problems.append("the mesh has no texture coordinates for its image")
             break
@@ -368,6 +375,11 @@ def _gltf(data: bytes, files: Files) -> list[trimesh.Trimesh]:
             raise FileNotFoundError(f"{files.path}: the mesh refers to the missing file {part['uri']}: add it")
         part["uri"], buffers[f"{number}"] = f"{number}", content
     _check(header, files)
+    for mesh in header.get("meshes", []):
+        for primitive in mesh["primitives"]:
+            if "material" not in primitive and "COLOR_0" in primitive["attributes"]:  # which trimesh would round
+                primitive["material"] = len(header.setdefault("materials", []))
+                header["materials"].append({})
     looks = [_look(material) for material in header.get("materials", [])]
     images = {} if files.plain else _images(header, files, buffers, looks)
     for number, (color, _) in enumerate(looks):

@@ -69,7 +69,7 @@ def _flat_corners(candidates: np.ndarray, most: int) -> list[int]:
     """Indices of at most `most` corners of those flat faces of a hull that have at least FLAT of its surface."""
     hull, found = ConvexHull(candidates), []
     planes, plane = np.unique(hull.equations.round(6), axis=0, return_inverse=True)
-    area = np.bincount(plane, weights=trimesh.triangles.area(candidates[hull.simplices]))
+    area = np.bincount(plane.reshape(-1), weights=trimesh.triangles.area(candidates[hull.simplices]))
     faces = np.flatnonzero(area >= FLAT * hull.area)
     each = max(3, most // max(len(faces), 1))
     for face in faces[np.argsort(-area[faces])][: most // 3]:

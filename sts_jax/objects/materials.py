@@ -110,7 +110,7 @@ def _piece_albedo(piece: trimesh.Trimesh, is_linear: bool) -> tuple[np.ndarray, 
         else:
             color = decode(_unit(np.asarray(factor))[:3])
         corner = np.broadcast_to(color, (len(faces), 3, 3))
-        painted = visual.vertex_attributes.get("color") if is_linear else None
+        painted = piece.vertex_attributes.get("color") if is_linear else None
         if painted is not None and len(painted) == len(piece.vertices):
             corner = corner * _unit(np.asarray(painted))[faces][..., :3]
         return np.array(corner), uv, image

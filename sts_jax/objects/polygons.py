@@ -147,7 +147,9 @@ def cut_ply(content: bytes) -> bytes:
 
     rows = {name: [[values(words) for words in layout[name]] for _ in range(count[name])] for name in layout}
     lists = [k for k, words in enumerate(layout.get("face", [])) if words[0] == "list"]
-    corners = next((k for k in lists if layout["face"][k][-1].startswith("vertex_ind")), *lists[:1])
+    corners = next((k for k in lists if layout["face"][k][-1].startswith("vertex_ind")), lists[0] if lists else None)
+    if corners is None:
+        raise ValueError("it has points, but no list of faces")
     if all(len(row[corners]) == 3 for row in rows.get("face", [])):
         return content
     names = [words[-1] for words in layout["vertex"]]
