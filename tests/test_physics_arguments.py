@@ -80,6 +80,7 @@ GIVEN = [
     ({"start": START._replace(pose=np.zeros((2, 7)))}, r"start\.pose has quaternions whose length is not 1"),
     ({"start": START._replace(condition=np.zeros((2, 1)))}, r"start\.condition has shape \(2, 1\), .* \(2, 0\)"),
     ({"start": START._replace(held=np.array(-1))}, r"start\.held is -1, but each value must be an integer >= 0"),
+    ({"start": START._replace(held=np.array(999))}, r"start\.held is 999, but it must be at most scenario\.steps"),
     ({"hidden": HIDDEN._replace(up=np.ones((2, 3)))}, r"hidden\.up has rows that are not unit vectors"),
     ({"hidden": HIDDEN._replace(fill=np.array([0, 1.5]))}, r"hidden\.fill is from 0.0 to 1.5"),
 ]
@@ -114,3 +115,17 @@ def test_what_place_refuses_is_named(changes, message):
 def test_stable_faces_are_not_computed_of_a_traced_body():
     with pytest.raises(TypeError, match=r"`body`, .* is traced.* outside jit"):
         jax.eval_shape(lambda body: inspect.unwrap(physics.stable_faces)(body), BODY)
+
+
+def test_a_scenario_that_holds_longer_than_the_interval_before_frame_0_is_named():
+    class Late(Freefall):
+        def start(self, key, shape, pad):
+            return super().start(key, shape, pad)._replace(held=jnp.asarray(2 * self.steps))
+
+    with pytest.raises(ValueError, match=r"scenario\.start returns held from \d+ to \d+ time steps"):
+        physics.simulate(**GOOD | {"scenario": Late(frames=20)})
+
+
+def test_short_intervals_have_starts_that_are_not_held():
+    sliding = physics.simulate(**GOOD | {"scenario": Inclined(rate=250.0, frames=2), "num": 8})
+    assert np.isfinite(sliding.pose).all()

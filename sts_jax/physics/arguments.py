@@ -54,6 +54,12 @@ def check_condition(scenario: Scenario, start: Start) -> None:
             f"scenario.start returns a condition of length {width}, but scenario.quantities declares {declared}: "
             "declare a physics.Quantity for each number or vector"
         )
+    held = np.asarray(start.held)
+    if held.min() < 0 or held.max() > scenario.steps:
+        raise ValueError(
+            f"scenario.start returns held from {held.min()} to {held.max()} time steps, but it must be from 0 to the "
+            f"{scenario.steps} time steps of the interval before frame 0"
+        )
 
 
 def check_outcomes(scenario: Scenario, outcome: np.ndarray) -> None:
@@ -81,6 +87,8 @@ def check_start(start: Start, scenario: Scenario, count: int) -> Start:
             raise ValueError(f"start.{name} has shape {values.shape}, but it must be one number or {(count,)}")
     if held.dtype.kind not in "iu" or held.min() < 0:
         raise ValueError(f"start.held is {start.held}, but each value must be an integer >= 0 (time steps)")
+    if held.max() > scenario.steps:
+        raise ValueError(f"start.held is {start.held}, but it must be at most scenario.steps, {scenario.steps}")
     if not (carried.min() >= 0 and carried.max() <= 1):
         raise ValueError(f"start.carried is from {carried.min()} to {carried.max()}, but it must be from 0 to 1")
     return Start(

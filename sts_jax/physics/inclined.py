@@ -109,7 +109,8 @@ class Inclined(Scenario):
             ]
         )
         height = jnp.where(rests, -STANDING, jax.random.uniform(gap, minval=self.gap[0], maxval=self.gap[1]))
-        held = jnp.where(rests, self.steps - round(LET_GO / self.contact.timestep), self.steps)
+        let_go = max(self.steps - round(LET_GO / self.contact.timestep), 0)
+        held = jnp.where(rests, let_go, self.steps)
         return Start(shape.above(place, geometry.quat_canonical(quat), height), held, jnp.zeros(0))
 
     def gravity(self, time: Float[Array, ""], condition: Float[Array, "0"]) -> Float[Array, "3"]:
