@@ -119,7 +119,7 @@ def write(
     inputs = storage.checksums(workdir, files)
     if stale(workdir, "results", inputs) is None:
         return
-    test, base = parts["test"], data["held"][parts["train"]].mean()
+    test, base = parts["test"], np.clip(data["held"][parts["train"]].mean(), 1e-4, 1 - 1e-4)
     rows = {CONSTANT: np.full((1, len(test)), base), **judged}
     scores = {name: score(row, data["held"][test]) for name, row in rows.items()}
     numbers = summarise(scores, data["object"][test])

@@ -8,8 +8,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+import trimesh
 
 import sts_jax as sts
+from sts_jax import scene
 from sts_jax.environments import Lift, State, Task
 from sts_jax.environments.task import Reward, Start, judge, placed
 
@@ -189,11 +191,37 @@ def test_judgement(place, forces, qpos, reward, done):
         ({"friction": (0.5, 0.2)}, r"task.friction is \(0.5, 0.2\)"),
         ({"control_dt": 0.0015}, "task.control_dt is 0.0015 s, but it must be a multiple of timestep, 0.001 s"),
         ({"offset": 0.04}, "opening is 0.1 m, but the object reaches"),
+        ({"height": 0.29}, r"task.height is 0.29 m, but the gripper rises by 0.278 m at most"),
     ],
 )
 def test_bad_tasks_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         Lift(sensor(), task=dataclasses.replace(TASK, **changes))
+
+
+@pytest.mark.parametrize(
+    ("size", "yaw", "offset"), [((0.03, 0.12), np.pi, 0.0), ((0.08, 0.03), 0.0, 0.011), ((0.08, 0.03), 0.6, 0.0078)]
+)
+def test_an_object_that_does_not_fit_at_some_start_is_refused(tmp_path, size, yaw, offset):
+    trimesh.creation.box((*size, 0.04)).export(tmp_path / "box.stl")
+    body = sts.objects.load(tmp_path / "box.stl", mass=0.1)
+    for sign in (-1, 1):
+        scene.gripper(sensor(), body, yaw=sign * yaw)  # it fits at the ends of the range of yaws
+    task = dataclasses.replace(TASK, yaw=yaw, offset=offset)
+    with pytest.raises(ValueError, match=r"opening is 0\.1 m, but the object reaches"):
+        Lift(sensor(), body, task)
+
+
+@pytest.mark.parametrize("fault", ["state", "action"])
+def test_what_diverges_ends_the_episode(gym_lift, fault):
+    gym_lift.reset(seed=0)
+    if fault == "state":
+        gym_lift.data.qvel[0] = 1e12
+    action = np.array([np.nan if fault == "action" else 0.0, 0.0], np.float32)
+    _, reward, terminated, _, _ = gym_lift.step(action)
+    assert (reward, terminated) == (0.0, True)
+    gym_lift.reset(seed=0)
+    assert not gym_lift.step(np.zeros(2, np.float32))[2]
 
 
 def test_an_unknown_render_mode_is_refused():

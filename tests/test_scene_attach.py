@@ -229,6 +229,19 @@ def test_sensors_store_all_contacts_that_mujoco_finds(crowd):
     assert 0 < found.max() <= SLOTS
 
 
+def test_a_press_of_a_signed_distance_field_is_felt_whole():
+    corners = " ".join(f"{x} {y} {z}" for x in (-0.02, 0.02) for y in (-0.02, 0.02) for z in (-0.02, 0.02))
+    spec = mujoco.MjSpec.from_string(f"""<mujoco>{OPTION}<asset><mesh name="cube" vertex="{corners}"/></asset>
+    <worldbody><site name="floor"/><body name="cube" pos="0 0 .0199"><freejoint/>
+    <geom type="sdf" mesh="cube" mass=".1" condim="6"/></body></worldbody></mujoco>""")
+    scene.attach(spec, "floor", SENSOR, name="floor")
+    model = spec.compile()
+    data = settled(model, 300)
+    force = scene.View(model, {"floor": SENSOR}).wrenches(data)["floor"]["cube"]
+    np.testing.assert_allclose(force, physics.wrench(model, data, "floor", "floor"), atol=1e-3)
+    assert data.sensor(0).data[0] > SLOTS  # contacts that were found
+
+
 REFUSED = {
     "a site that does not exist": ({"site": "tpi"}, "no site 'tpi', only 'floor', 'line', 'tip'"),
     "a site between two points": ({"site": "line"}, "the site 'line' is given by fromto"),

@@ -269,13 +269,21 @@ def late() -> mujoco.MjModel:
     return spec.compile()
 
 
-def on_finger(sensor: sts.Sensor, half: float, z: float = 0) -> mujoco.MjModel:
+def on_finger(sensor: sts.Sensor, half: float, z: float = -0.015) -> mujoco.MjModel:
     geom = f'<geom type="box" size="{half} .02 .01" pos="0 0 {z}"/>'
     spec = mujoco.MjSpec.from_string(
         f'<mujoco><worldbody>{BALL}<body name="finger"><joint/>{geom}<site name="tip"/></body></worldbody></mujoco>'
     )
     scene.attach(spec, "tip", sensor, name="pad")
     return spec.compile()
+
+
+def test_a_finger_that_collides_in_the_place_of_its_pad_is_named():
+    sensors = {"sensors": {"pad": SMALL}}
+    scene.View(on_finger(SMALL, 0.02, -0.0103), **sensors)  # behind the pad's face by 0.3 mm
+    for z in (-0.01, -0.005):  # flush with it, and in front of it
+        with pytest.warns(UserWarning, match="reaches to the face of its pad 'pad' and collides, too"):
+            scene.View(on_finger(SMALL, 0.02, z), **sensors)
 
 
 def without_faces() -> mujoco.MjModel:

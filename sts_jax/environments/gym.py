@@ -21,6 +21,7 @@ from sts_jax.environments.task import (
 )
 from sts_jax.environments.task import setting as task_setting
 from sts_jax.objects.body import Body
+from sts_jax.physics.native import quiet
 from sts_jax.sensor import Sensor
 
 try:
@@ -32,6 +33,7 @@ except ImportError as error:
     ) from error
 
 EPISODE = 150  # actions of an episode of `gymnasium.make`
+_DIVERGED = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}")) for name in ("QPOS", "QVEL", "QACC", "CTRL")]
 
 Observation = dict[str, np.ndarray]
 
@@ -82,9 +84,12 @@ class GymLift(gymnasium.Env[Observation, np.ndarray]):
     def step(self, action: Float[np.ndarray, "2"]) -> tuple[Observation, float, bool, bool, dict]:
         """Move the targets of the servos, and advance the physics by `task.control_dt`."""
         self.data.ctrl[:] = target(self.setting, self.task, self.data.ctrl, action)
-        mujoco.mj_step(self.model, self.data, self.task.substeps)
+        with quiet():
+            mujoco.mj_step(self.model, self.data, self.task.substeps)
         reward, lost, info = self._judge()
-        return self._observe(), reward, lost, False, info
+        # MuJoCo resets what diverges, and takes 0 for an action that is not finite, so the state shows neither.
+        diverged = any(self.data.warning[kind].number for kind in _DIVERGED)
+        return self._observe(), 0.0 if diverged else reward, lost or diverged, False, info
 
     def render(self) -> np.ndarray | None:
         """Images of the observation in one, uint8: left and right pad, visual stream above tactile stream."""

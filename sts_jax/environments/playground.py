@@ -39,8 +39,8 @@ class State:
 class Lift:
     """Close on an object and lift it: `reset` and `step` are pure, and run under `jit` and `vmap`.
 
-    The class has the methods and properties of Playground's `MjxEnv`, so that its wrappers and Brax accept it, but does
-    not need Playground. Episodes have no length of their own. An observation is a dictionary:
+    The class has the methods and properties of Playground's `MjxEnv`, so that its wrappers accept it, but does not need
+    Playground. Episodes have no length of their own. An observation is a dictionary:
 
     - `state`: (6,), height and opening of the gripper (m), their velocities (m/s) and their targets (m).
     - `pixels/left_visual`, `pixels/left_tactile`, `pixels/right_visual`, `pixels/right_tactile`: (h, w, 3) in [0, 1].
@@ -48,6 +48,7 @@ class Lift:
     An action has the components lift and grip in [-1, 1]: velocities of the targets of the two servos, up and closing.
     """
 
+    @in_32_bits
     def __init__(self, sensor: Sensor | None = None, body: Body | None = None, task: Task | None = None) -> None:
         """Build the scene.
 

@@ -13,10 +13,12 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from sts_jax import geometry, scene
 from sts_jax._checked import checked
 from sts_jax.objects.body import Body
+from sts_jax.scene.hand import corners
 from sts_jax.sensor import Sensor
 
 PADS = ("left", "right")
 STREAMS = ("visual", "tactile")
+_YAWS = 181  # yaws at which an object must fit between the fingers
 LARGEST = 10.0  # largest number in the part of an observation that is no image
 ACTIONS = ("lift", "grip")  # an action's components, in the order of the actuators
 
@@ -100,8 +102,11 @@ def setting(sensor: Sensor, body: Body | None, task: Task) -> Setting:
     build = functools.partial(
         scene.gripper, sensor, body, mass=task.mass, grip=task.grip, timestep=task.timestep, friction=task.friction[1]
     )
-    for sign in (-1, 1):  # an object that does not fit between the fingers raises an error here
-        build(yaw=sign * task.yaw, position=(sign * task.offset, 0.0))
+    # An object that does not fit between the fingers raises an error here: the corner and the yaw that reach farthest.
+    yaws = np.linspace(-task.yaw, task.yaw, _YAWS)
+    reach = corners(body)[:, :2] @ np.stack([np.cos(yaws), -np.sin(yaws)])
+    corner, yaw = np.unravel_index(np.abs(reach).argmax(), reach.shape)
+    build(yaw=float(yaws[yaw]), position=(float(np.copysign(task.offset, reach[corner, yaw])), 0.0))
     spec = build()
     for side in PADS:
         scene.attach(spec, f"{side}_tip", sensor, name=side)
@@ -111,6 +116,10 @@ def setting(sensor: Sensor, body: Body | None, task: Task) -> Setting:
     mujoco.mj_resetDataKeyframe(model, home, model.key("home").id)
     mujoco.mj_forward(model, home)
     lift = model.joint("lift").range
+    if home.ctrl[0] + task.height > lift[1]:
+        raise ValueError(
+            f"task.height is {task.height} m, but the gripper rises by {lift[1] - home.ctrl[0]:.3f} m at most"
+        )
     number = model.body("object").id
     return Setting(
         model=model,

@@ -21,7 +21,9 @@ BOX = (0.03, 0.04, 0.05)  # m, size of the object without a `Body`
 REACH = 0.15  # m, from the middle of the sensors up to the palm
 MAST = 0.3  # m, largest height of the middle of the sensors
 HAND_MASS, FINGER_MASS = 0.6, 0.1  # kg
-SLIPPERY = 1e-5  # friction of all geoms but the object: two geoms without friction make NaN in MJX (C takes this value)
+SLIPPERY = (
+    1e-5  # friction of the table, so that an object has its own: no friction makes NaN in MJX (C takes this value)
+)
 LIFT_GAINS = 2e4, 400.0  # N/m, N s/m, of the servo that lifts the hand: 22 Hz, critically damped with a full hand
 GRIP_GAINS = 4e3, 40.0  # N/m, N s/m, of the servo that closes the fingers, whose force is limited
 
@@ -29,13 +31,13 @@ _SCENE = """
 <mujoco model="gripper">
   <option timestep="{timestep}" cone="elliptic" impratio="10" integrator="implicitfast"/>
   <default>
-    <geom condim="6" friction="{slippery} {slippery} {slippery}" solref="0.004 1"/>
+    <geom condim="6" solref="0.004 1"/>
     <default class="shown"><geom type="box" contype="0" conaffinity="0" mass="0" rgba=".25 .27 .3 1"/></default>
   </default>
   <asset>{mesh}</asset>
   <worldbody>
     <light pos="0 0 1.5" castshadow="false"/>
-    <geom name="table" type="plane" size=".3 .3 .05" rgba=".62 .5 .38 1"/>
+    <geom name="table" type="plane" size=".3 .3 .05" friction="{slippery} {slippery} {slippery}" rgba=".62 .5 .38 1"/>
     <body name="hand" pos="0 0 {height}" gravcomp="1">
       <inertial pos="0 0 {reach}" mass="{hand}" diaginertia="1e-3 1e-3 1e-3"/>
       <joint name="lift" type="slide" axis="0 0 1" ref="{height}" range="0 {mast}"/>
@@ -106,10 +108,7 @@ def gripper(
     size, thickness = np.asarray(sensor.gel.size, float), float(sensor.gel.thickness)
     height = size[1] / 2 + CLEARANCE if height is None else height
     _check(mass=mass, friction=friction, grip=grip, opening=opening, height=height, timestep=timestep)
-    points = np.array(np.meshgrid(*([-side / 2, side / 2] for side in BOX))).reshape(3, -1).T
-    if body is not None:
-        body.check()
-        points = np.asarray(body.hulls, np.float64).reshape(-1, 3)
+    points = corners(body)
     turn = Rotation.from_rotvec([0, 0, yaw])
     placed = turn.apply(points) + np.array([*position, 0])
     if 2 * np.abs(placed[:, 0]).max() >= opening:
@@ -164,6 +163,14 @@ def gripper(
         opening=opening,
     )
     return mujoco.MjSpec.from_string(xml)
+
+
+def corners(body: Body | None) -> Float[np.ndarray, "n 3"]:
+    """Corners of the object in its mesh frame (m)."""
+    if body is None:
+        return np.array(np.meshgrid(*([-side / 2, side / 2] for side in BOX))).reshape(3, -1).T
+    body.check()
+    return np.asarray(body.hulls, np.float64).reshape(-1, 3)
 
 
 def _check(**numbers: float) -> None:

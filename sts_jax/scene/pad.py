@@ -22,8 +22,9 @@ from sts_jax.physics.scene import CONDIM
 from sts_jax.sensor import Sensor
 from sts_jax.tactile import Gel
 
-SLOTS = 8  # contacts that MuJoCo finds at most between two geoms, except for height fields
-HEIGHT_FIELD_SLOTS = 50  # the same for height fields (mjMAXCONPAIR)
+SLOTS = 8  # contacts that MuJoCo finds at most between two geoms, except for those of `_MANY`
+MANY_SLOTS = 50  # the same for the types in `_MANY` (mjMAXCONPAIR)
+_MANY = mujoco.mjtGeom.mjGEOM_HFIELD, mujoco.mjtGeom.mjGEOM_SDF
 # What a sensor stores of each contact: found (1), force (3), torque (3), dist (1), pos (3), normal (3), tangent (3).
 DATA = sum(
     1 << int(getattr(mujoco.mjtConDataField, f"mjCONDATA_{name}"))
@@ -167,7 +168,6 @@ def _add_contact_sensors(spec: mujoco.MjSpec, pad: mujoco.MjsGeom) -> None:
         if not other.name:
             other.name = next(new for new in _names(f"{other.parent.name or 'geom'}") if new not in taken)
             taken.add(other.name)
-        field_of_heights = other.type == mujoco.mjtGeom.mjGEOM_HFIELD
         spec.add_sensor(
             name=f"{pad.name} on {other.name}",
             type=mujoco.mjtSensor.mjSENS_CONTACT,
@@ -175,7 +175,7 @@ def _add_contact_sensors(spec: mujoco.MjSpec, pad: mujoco.MjsGeom) -> None:
             objname=pad.name,
             reftype=mujoco.mjtObj.mjOBJ_GEOM,
             refname=other.name,
-            intprm=[DATA, BY_DISTANCE, HEIGHT_FIELD_SLOTS if field_of_heights else SLOTS],
+            intprm=[DATA, BY_DISTANCE, MANY_SLOTS if other.type in _MANY else SLOTS],
         )
 
 

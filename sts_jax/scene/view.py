@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from sts_jax import geometry
-from sts_jax._checked import checked, in_32_bits
+from sts_jax._checked import checked, in_32_bits, warn
 from sts_jax._ranges import MOST_PIXELS
 from sts_jax.frame import Frame
 from sts_jax.objects.body import Body, is_traced
@@ -25,6 +25,7 @@ from sts_jax.sensor import Sensor
 
 _CONTACT = 17  # numbers that a sensor of `attach` stores of each contact
 _OVERHANG = 1.02  # a pad may be larger than its finger by this factor
+_BEHIND = 2e-4  # m, least depth of the finger's own colliding geoms below the pad's face, more than contacts sink in
 _GEOM = mujoco.mjtObj.mjOBJ_GEOM
 
 
@@ -264,18 +265,19 @@ def _pad_geom(model: mujoco.MjModel, name: str, sensor: Sensor) -> int:
 
 
 def _check_finger(model: mujoco.MjModel, name: str, pads: Mapping[str, int]) -> None:
-    """Raise a ValueError if a pad faces the body that carries it, or is larger, seen along the pad's normal."""
+    """Raise a ValueError if a pad faces the body that carries it, or is larger, seen along the pad's normal.
+
+    A geom of this body that collides at the pad's face, too, takes a part of the force, and causes a warning.
+    """
     pad, site = pads[name], model.site(name)
     carrier = int(model.geom_bodyid[pad])
-    geoms = np.setdiff1d(np.flatnonzero(model.geom_bodyid == carrier), list(pads.values()))
+    geoms = np.setdiff1d(np.flatnonzero(model.geom_bodyid == carrier), list(pads.values())).tolist()
     if carrier == 0 or not len(geoms):
         return
     turn = Rotation.from_quat(site.quat, scalar_first=True).as_matrix()
-    signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), axis=-1).reshape(8, 3)
     corners = []
     for geom in geoms:
-        box = model.geom_aabb[geom]
-        turned = Rotation.from_quat(model.geom_quat[geom], scalar_first=True).apply(box[:3] + signs * box[3:])
+        turned = Rotation.from_quat(model.geom_quat[geom], scalar_first=True).apply(_corners(model, geom))
         corners.append((turned + model.geom_pos[geom] - site.pos) @ turn)
     size, finger = 2 * model.geom_size[pad][:2], np.ptp(np.concatenate(corners), axis=0)[:2]
     if (size > _OVERHANG * finger).any():
@@ -293,6 +295,25 @@ def _check_finger(model: mujoco.MjModel, name: str, pads: Mapping[str, int]) -> 
             f"{_millimetres([depth.max()])} in front of the gel and not behind it: turn the site, whose z axis must "
             "point out of the finger"
         )
+    for geom, part in zip(geoms, corners, strict=True):
+        covers = (part.min(axis=0)[:2] < 0).all() and (part.max(axis=0)[:2] > 0).all()
+        touches = (model.geom_contype[geom] | model.geom_conaffinity[geom]) and part[:, 2].max() > -_BEHIND
+        if covers and touches and part[:, 2].min() < 0:
+            warn(
+                f"geom {geom_name(model, geom)} of the body {_body_name(model, carrier)!r} reaches to the face of its "
+                f"pad {name!r} and collides, too, so the pad feels only a part of the force: move the site out of the "
+                "finger by the gel's thickness, or set the geom's contype and conaffinity to 0"
+            )
+
+
+def _corners(model: mujoco.MjModel, geom: int) -> Float[np.ndarray, "n 3"]:
+    """Corners of a geom in its own frame (m): of its mesh, or of its box."""
+    mesh = model.geom_dataid[geom] if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH else -1
+    if mesh >= 0:
+        first = model.mesh_vertadr[mesh]
+        return np.asarray(model.mesh_vert[first : first + model.mesh_vertnum[mesh]], np.float64)
+    box = model.geom_aabb[geom]
+    return box[:3] + np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), axis=-1).reshape(8, 3) * box[3:]
 
 
 def _touchable(model: mujoco.MjModel, pad: int) -> Int[np.ndarray, "k"]:
