@@ -14,10 +14,11 @@ from sts_jax._checked import checked, in_32_bits, warn
 from sts_jax._plausible import placement_problem
 from sts_jax._ranges import MOST_PIXELS
 from sts_jax.objects.body import FACE_CLASSES, Body, is_traced
-from sts_jax.optics import Camera
 from sts_jax.rendering import drawing, equilibrium
 from sts_jax.rendering.group import draw_group, group
 from sts_jax.sensor import Sensor
+
+_SHORTEST = 0.002  # m, length of edges that may be clipped if the camera is traced, for pads of at least 8 mm
 
 
 @jax.tree_util.register_dataclass
@@ -130,8 +131,7 @@ def sense(
         drawn |= {"pressure": resting.pressure, "shear": resting.shear}
     else:
         # A face that reaches from before `near` into the view beyond the gel has a longer edge.
-        camera = Camera() if is_traced(camera) else camera
-        longest = (float(camera.distance) - float(camera.near)) / 2
+        longest = _SHORTEST if is_traced(camera) else (float(camera.distance) - float(camera.near)) / 2
         together = group(bodies, longest)
         drawn = draw_group(
             sensor,

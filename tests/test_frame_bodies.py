@@ -249,3 +249,41 @@ def test_an_invalid_pose_or_wrench_removes_only_its_body():
         assert set(np.unique(frame.body)) == {-1, 0}
         assert np.isfinite(frame.visual).all()
         assert np.isfinite(frame.tactile).all()
+
+
+@pytest.mark.filterwarnings("ignore:.*pose puts")
+def test_a_body_below_the_gel_is_never_drawn():
+    above, below = (BALL, at(0, 0, 0.04), NOTHING), (BALL, at(0, 0, -0.05), NOTHING)
+    frame = many(above, below)
+    assert set(np.unique(frame.body)) == {-1, 0}
+    np.testing.assert_allclose(frame.depth, many(above).depth, rtol=1e-6)
+
+
+def test_a_traced_sensor_draws_the_same_faces():
+    tip = sts.Sensor.sized(0.02)
+    wall = from_trimesh(trimesh.creation.box((0.004, 0.02, 0.03)))
+    given = [wall], at(0.006, 0, 0)[None], NOTHING[None]  # from the housing far into the view
+    traced = jax.jit(lambda sensor: sense(sensor, *given, resolution=SIZE).depth)(tip)
+    expected = sense(tip, *given, resolution=SIZE).depth
+    assert np.isfinite(expected).sum() > 100
+    np.testing.assert_allclose(traced, expected, rtol=1e-4)
+
+
+@pytest.mark.filterwarnings("ignore:.*pose puts")
+def test_parts_beside_or_far_below_the_face_do_not_hide_what_presses():
+    def box(*size, place):
+        return trimesh.creation.box(size, trimesh.transformations.translation_matrix(place))
+
+    bar = box(0.1, 0.02, 0.01, place=(0.05, 0, 0.005))  # reaches beyond the pad, whose edge is at x = 75 mm
+    leg = box(0.01, 0.02, 0.07, place=(0.095, 0, -0.03))
+    pressures = [
+        sense(SENSOR, from_trimesh(shape), at(0, 0, -0.001), resolution=(8, 8)).pressure
+        for shape in (bar, trimesh.util.concatenate([bar, leg]))
+    ]
+    assert np.sum(pressures[0] > 0) > 50
+    np.testing.assert_allclose(pressures[1], pressures[0], atol=1)
+    deep = sense(SENSOR, ball(0.005), at(0, 0, -0.003), resolution=(8, 8))  # its centre is below the face
+    cells = np.argwhere(np.asarray(deep.pressure) > 0)
+    size = np.array(SENSOR.gel.size)[::-1] / np.array(SENSOR.gel.cells)
+    across = np.ptp(cells, axis=0) * size
+    np.testing.assert_allclose(across, 2 * np.sqrt(0.005**2 - 0.003**2), atol=2.1 * size.max())

@@ -117,9 +117,10 @@ def underside(
     """
     rows, columns = gel.cells
     across, down, height = (points[:, k] for k in range(3))
-    # A part never presses if it is higher above the lowest point than the largest depth and tilt can lower it.
+    # A part never presses if it is higher above the lowest point, or above the gel's face where this is higher (parts
+    # beside the pad can be lower), than the largest depth and tilt can lower it.
     extent = sum(_cpu_reductions.maximum(part) - _cpu_reductions.minimum(part) for part in (across, down))
-    reach = _cpu_reductions.minimum(height) + gel.max_depth + jnp.tan(gel.max_tilt) * extent
+    reach = jnp.maximum(_cpu_reductions.minimum(height), 0) + gel.max_depth + jnp.tan(gel.max_tilt) * extent
     across = (across / gel.size[0] + 0.5) * columns - 0.5
     down = (down / gel.size[1] + 0.5) * rows - 0.5
     keep = jnp.broadcast_to(present, height.shape)

@@ -225,7 +225,10 @@ def _balanced(
         sensor, group, points, ahead, group.of_body, jnp.arange(number), touching, wrenches
     )
     balanced_poses = jax.vmap(moved)(safe_poses, contact)
-    placed = jax.lax.cond(jnp.any(touching), lambda: _placed(group, balanced_poses, present, lowest), lambda: placed)
+    shown_poses = jnp.where(jnp.any(touching), balanced_poses, safe_poses)
+    placed = jax.lax.cond(
+        jnp.any(touching) | ~jnp.all(present), lambda: _placed(group, shown_poses, present, lowest), lambda: placed
+    )
     return (
         Resting(
             points=placed.points,
