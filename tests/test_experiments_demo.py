@@ -133,6 +133,12 @@ def test_hold_release_and_what_happened(page, served):
     assert until_done(page)["phase"] == "held"
     assert not view(page)["let_go"]
     assert view(page)["happened"] is None
+    held(page)
+    assert press(page, hand="release") == 204
+    until_done(page)
+    assert press(page, hand="clear") == 204
+    assert until_done(page)["phase"] == "empty"
+    assert not view(page)["let_go"]
 
 
 def test_an_object_that_falls_off(page, served):

@@ -133,6 +133,22 @@ def test_buttons_count_only_for_the_stage_that_was_shown(page):
     assert page.action() is Action.STOP
 
 
+def test_a_second_press_does_not_count_for_the_next_stage(page):
+    page.show(view())
+    good = {"action": "confirm", "stage": "review", "number": 0}
+    for next_stage, left in ((Stage.CLEAR, None), (Stage.REVIEW, Action.CONFIRM)):
+        assert ask(page, "POST", "/action", good, **{"X-Collect": "1"})[0] == 204
+        assert page.action() is Action.CONFIRM
+        assert ask(page, "POST", "/action", good, **{"X-Collect": "1"})[0] == 204  # before the next view
+        page.show(view(next_stage, number=0 if left else None))
+        assert page.action() is left
+        page.show(view())
+    stop = {"action": "stop", "stage": "review", "number": 0}
+    assert ask(page, "POST", "/action", stop, **{"X-Collect": "1"})[0] == 204
+    page.show(view(Stage.CLEAR, number=None))
+    assert page.action() is Action.STOP
+
+
 def test_other_sites_can_neither_see_nor_press(page):
     page.show(view())
     good = {"action": "confirm", "stage": "review", "number": 0}

@@ -307,7 +307,7 @@ class Device:
     Values are whole, and the exposure is ignored while its control is automatic.
     """
 
-    plugged, stuck = True, ()
+    plugged, stuck, late = True, (), 0
 
     def __init__(self, **values):
         self.values = {getattr(cv2, f"CAP_PROP_{name}"): value for name, value in values.items()}
@@ -324,8 +324,11 @@ class Device:
         return self.plugged
 
     def grab(self):
-        time.sleep(0.01)
-        self.values[cv2.CAP_PROP_POS_MSEC] += 10
+        if self.late:  # frames that wait in the driver
+            self.late -= 1
+        else:
+            time.sleep(0.01)
+            self.values[cv2.CAP_PROP_POS_MSEC] = 5e6 + 1000 * time.monotonic()
         return self.plugged
 
     def retrieve(self):
@@ -358,6 +361,10 @@ def test_a_device_is_locked_after_its_warm_up_and_again_after_a_loss(device):
         device.plugged = True
         assert next_frame(camera).epoch == 1
         assert [device.get(prop) for prop in (cv2.CAP_PROP_EXPOSURE, cv2.CAP_PROP_AUTO_WB)] == [80, 0]
+        get, device.get = device.get, lambda prop: -1.0  # while the camera is being unplugged
+        assert camera.set_exposure(60) is None
+        device.get = get
+        assert camera.locked == {"exposure": 80, "white_balance": 4600}
         device.stuck = {cv2.CAP_PROP_AUTO_EXPOSURE}
         device.values[cv2.CAP_PROP_AUTO_EXPOSURE] = 3
         assert camera.set_exposure(60) is None
@@ -403,3 +410,25 @@ def test_cameras_are_found_by_serial_number_and_number(tmp_path):
     assert str(found[1]).endswith("video2 (Camera 2)")
     assert stable_path(str(dev / "video0"), tmp_path) == found[0].source
     assert stable_path(str(dev / "video2"), tmp_path) == str(dev / "video2")
+
+
+def test_frames_that_waited_in_the_driver_are_delayed(device):
+    with OpenCVCamera(config(0, buffer=30)).connect(warmup_s=0.2) as camera:
+        assert not any(camera.async_read().delayed for _ in range(10))
+        grab, stalled = device.grab, []
+
+        def stall():
+            if not stalled:
+                stalled.append(time.sleep(0.3))
+                device.late = 4
+            return grab()
+
+        device.grab = stall
+        shown = [camera.async_read() for _ in range(20)]
+        assert sum(frame.delayed for frame in shown) >= 4
+        device.late = 0
+        device.plugged = False
+        assert next_error(camera, CameraLostError)
+        device.plugged = True
+        assert next_frame(camera).delayed  # the first frame after the camera was found
+        assert not camera.read().delayed

@@ -87,6 +87,9 @@ def test_a_session_is_continued_and_its_trajectories_discarded_restored_and_conf
         assert session.confirmed == 2
         assert hardware.load_recordings(tmp_path).identity == before
         session.confirm(2, "later")
+        for number in (0, 2):
+            with pytest.raises(FileExistsError, match=f"trajectory {number} is confirmed already"):
+                session.confirm(number)
     notes = [(trajectory.number, trajectory.note) for trajectory in hardware.load_recordings(tmp_path)]
     assert notes == [(0, "note 0"), (1, "note 1"), (2, "later")]
 

@@ -67,6 +67,21 @@ def test_only_requests_for_its_own_name_and_from_its_own_pages_are_answered(port
     assert status(port, method, **headers) == code
 
 
+def test_a_server_on_all_addresses_has_the_names_of_its_computer():
+    server = web.Server("0.0.0.0", 0, Handler)
+    thread = threading.Thread(target=server.serve_forever, args=(0.01,))
+    thread.start()
+    name = socket.gethostname()
+    found = [
+        status(server.server_port, Host=host)
+        for host in (name, f"{name.upper()}.local:80", "192.168.0.1", "evil.example")
+    ]
+    server.shutdown()
+    server.server_close()
+    thread.join()
+    assert found == [200, 200, 200, 403]
+
+
 @pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.1\r\n", b"GET / HTTP/1.1\r\nHost: localhost\r\nA: "])
 def test_a_client_that_sends_nothing_or_byte_by_byte_is_disconnected(port, sent):
     with connected(port) as connection:

@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import itertools
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -107,7 +108,7 @@ class TwinHand:
         self.doing: str | None = None  # command that runs, or None
         self.problem: str | None = None  # error of the last command, or None
         self.held_s: float | None = None  # time since which the object is held (s), or None
-        self.let_go = False  # True from the command `release` until the object is held again
+        self.let_go = False  # True from the command `release` until the object is held or taken away
 
     @classmethod
     def of_camera(cls, camera: str | int) -> "TwinHand | None":
@@ -122,7 +123,8 @@ class TwinHand:
         """Send a request, and return the twin's answer. A request that the twin refuses raises a ValueError."""
         try:
             request = urllib.request.Request(f"{self._url}/{path}", method=method)
-            with urllib.request.urlopen(request, timeout=_ANSWER_S if method == "POST" else _STATE_S) as answer:
+            direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))  # twins are on this computer
+            with direct.open(request, timeout=_ANSWER_S if method == "POST" else _STATE_S) as answer:
                 return json.load(answer)
         except urllib.error.HTTPError as error:
             with error:
@@ -154,9 +156,10 @@ class TwinHand:
                 time.sleep(_POLL_S)
                 self.state = self.ask("state", "GET")
             if command == "hold":
-                self.held_s, self.let_go = time.monotonic(), False
+                self.held_s = time.monotonic()
+            self.let_go = command == "release"
         except (OSError, ValueError) as error:
-            self.problem = str(error)
+            self.problem, self.let_go = str(error), self.let_go and command != "release"
         finally:
             self.doing = None
 
@@ -174,7 +177,11 @@ def own_twin(folder: Path, config: TwinConfig = TwinConfig()) -> Iterator[tuple[
     # process ends, the pipe is closed, and the twin stops by itself.
     command = [sys.executable, "-m", "experiments.twin", "--attached", "--port", leds, *options]
     pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, start_new_session=True) as process:
+    # On a GPU, one process would take the memory that the other one needs.
+    environment = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false", **os.environ}
+    with subprocess.Popen(
+        command, stdin=pipe, stdout=pipe, text=True, start_new_session=True, env=environment
+    ) as process:
         try:
             assert process.stdout is not None
             printed = list(itertools.takewhile(lambda line: "Ctrl-C" not in line, process.stdout))

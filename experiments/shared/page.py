@@ -7,6 +7,7 @@ header that only the page itself can send, too.
 import abc
 import contextlib
 import json
+import socket
 import threading
 import time
 from pathlib import Path
@@ -56,7 +57,8 @@ class Page(abc.ABC, Generic[State]):
         self._thread.start()
         reach = "only this computer" if self._server.is_local else "EVERY computer that reaches this address"
         self.url = f"{self._server.url}/"
-        say(f"open {self.url} in a browser. The page listens on {host}, so {reach} can {self.use}")
+        name = "" if self._server.is_local else f" (elsewhere: http://{socket.gethostname()}:{self.port}/)"
+        say(f"open {self.url} in a browser{name}. The page listens on {host}, so {reach} can {self.use}")
 
     @abc.abstractmethod
     def facts(self, state: State) -> dict[str, Any]:
@@ -175,6 +177,15 @@ class CollectPage(Page[View]):
     use = "watch and press the buttons"
     hand: TwinHand | None = None  # the hand of the sensor, if it is a twin
     _action: Action | None = None
+
+    def show(self, state: View) -> None:
+        """See `Page.show`. A button that was pressed twice does not count for the next stage or trajectory."""
+        with self._changed:
+            old = self.state
+            confirmed = self._action is Action.CONFIRM and old is not None and old.stage is not state.stage
+            if old is not None and self._action is not Action.STOP and (confirmed or old.number != state.number):
+                self._action = None
+            super().show(state)
 
     def action(self) -> Action | None:
         """The action of the button that was pressed last, or None if no button was pressed since the last call."""

@@ -28,6 +28,7 @@ SmallBlocks = Float[np.ndarray, "48 64 3"]  # means of blocks of half the width 
 
 _NORMAL = 1.4826  # ratio of the standard deviation to the median absolute deviation of a normal distribution
 _SMALL_BLOCKS = 64, 48  # numbers of columns and rows of the small blocks
+_WAIT_S = 0.1  # wait after a read that failed (s)
 _KEPT = 16  # number of earlier observations that are kept in `State.window` besides its first one
 
 
@@ -352,6 +353,7 @@ def collect(
             failing_since_s = failing_since_s or time.monotonic()
             if time.monotonic() - failing_since_s > patience_s:
                 raise
+            time.sleep(_WAIT_S)
             state, problem = interrupted(state), str(error)
         except OSError as error:  # the disk is full, or the pair could not be saved. The next pair tries again
             problem = str(error)

@@ -345,7 +345,10 @@ class Connection:
         return DisconnectedError(f"the port {self.name} is gone or closed ({error}): check the cable, and reconnect().")
 
 
-_FLASH = "Flash the firmware of this version of sts_jax with `make flash PORT=...` in sts_jax/hardware/firmware."
+_FLASH = (
+    "Flash the firmware of this version of sts_jax with `make flash PORT=...` (and its SERIAL=..., if it had one) in "
+    "sts_jax/hardware/firmware."
+)
 _CAUSES = {
     errno.EACCES: "no permission: add your user to the port's group, usually with `sudo usermod -aG dialout $USER`",
     errno.EAGAIN: "it is in use: close the other program (`fuser` names it), or choose another port",

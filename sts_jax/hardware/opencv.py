@@ -7,6 +7,7 @@ import math
 import os
 import threading
 import time
+import urllib.parse
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -36,6 +37,8 @@ LONGEST_WAIT_S = 5.0  # s, longest of these waits
 _IN_FLIGHT = 2  # frames that may be in exposure or transfer at once. `read` discards as many
 _MJPG = cv2.VideoWriter.fourcc(*"MJPG")
 _TAIL = 1024  # bytes within which a complete JPEG image ends with its marker
+_AGES = 61  # number of frames whose ages are compared
+_LATE_S = 0.02  # a frame of a device that is older than the youngest one by more than this was delayed (s)
 _RATE_TOLERANCE = 0.02  # share by which a driver may round the frame rate
 
 # Field of `CameraConfig`, OpenCV's property, the property of its automatic control, and the value that turns this off
@@ -174,12 +177,14 @@ class OpenCVCamera:
         if self.config.kind != "device":
             raise CameraError(f"{self.config.name} is a stream: set the exposure at its server.")
 
+        held: dict[str, float] = {}
+
         def task(capture: Capture) -> None:
-            self._held.pop("exposure", None)
-            self._held |= lock(capture.device, {"exposure": exposure})[0]
+            held.update(lock(capture.device, {"exposure": exposure})[0])
+            self._held |= held  # empty if the camera is being lost, and then has the earlier exposure when it is back
 
         self._between_frames(task)
-        return self._held.get("exposure")
+        return held.get("exposure")
 
     def read(self, timeout_ms: float | None = None) -> Captured:
         """Return a frame whose exposure began after the start of this call: the third that arrives."""
@@ -280,9 +285,9 @@ class OpenCVCamera:
                 self._stop.wait(wait_s)
                 wait_s = min(2 * wait_s, LONGEST_WAIT_S)
                 continue
+            # A device forgets its settings without power.
+            self._refused = capture.warnings + lock(capture.device, self._held)[1]
             with self._changed:
-                # A device forgets its settings without power.
-                self._refused = capture.warnings + lock(capture.device, self._held)[1]
                 if self._epoch >= 0:
                     self._pace.interrupted()
                 self._epoch += 1
@@ -294,6 +299,9 @@ class OpenCVCamera:
         config = self.config
         previous: Captured | None = None
         repeats, same_since = 0, 0.0
+        # Ages at which recent frames arrived (s), on clocks with an unknown difference. The driver keeps frames that
+        # this thread fetches too late. They are older than others, as the first frame of a camera that was lost may be.
+        ages: collections.deque[float] = collections.deque(maxlen=_AGES)
         while capture.grab():
             # Time and number are set under one lock, so a later call of `read` sees that this frame arrived before.
             with self._changed:
@@ -301,7 +309,10 @@ class OpenCVCamera:
                 self._next += 1
                 stamp = capture.stamp()
                 dropped = self._pace.arrived(stamp or time_s)
-                delayed = self._pace.delayed and not stamp
+                delayed = self._pace.delayed
+                if stamp:
+                    delayed = (not ages and self._epoch > 0) or time_s - stamp > min(ages, default=math.inf) + _LATE_S
+                    ages.append(time_s - stamp)
             image = capture.retrieve()
             if self._stop.is_set():
                 return
@@ -454,6 +465,9 @@ def _open(config: CameraConfig) -> cv2.VideoCapture:
         # OpenCV reads this variable at its first frame. Without it, a stalled device blocks for 10 s.
         os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", str(math.ceil(config.timeout_s)))
         return cv2.VideoCapture(config.path, cv2.CAP_V4L2)
+    host, exempt = urllib.parse.urlsplit(config.path).hostname, os.environ.get("no_proxy", "")
+    if host in ("127.0.0.1", "localhost") and host not in exempt:  # FFmpeg would ask a proxy for this computer
+        os.environ["no_proxy"] = f"{exempt},{host}".strip(",")
     milliseconds = round(1000 * config.timeout_s)
     parameters = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, milliseconds, cv2.CAP_PROP_READ_TIMEOUT_MSEC, milliseconds]
     parameters += [cv2.CAP_PROP_N_THREADS, 1]  # a decoder with n threads delays the images by n frames

@@ -177,6 +177,8 @@ class Session:
     def confirm(self, number: int, note: str = "") -> None:
         """Confirm a trajectory whose pairs were saved, so that `load_recordings` includes it. The note is stored."""
         path = _trajectory(self.folder, number)
+        if number in self._confirmed:
+            raise FileExistsError(f"trajectory {number} is confirmed already, with its note and date.")
         files = {}
         for end in _ENDS:
             pair = storage.read_manifest(path / end, _remedy(number), _PairFacts)

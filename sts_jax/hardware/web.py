@@ -124,6 +124,9 @@ class Handler(http.server.BaseHTTPRequestHandler):
             name = urllib.parse.urlsplit("//" + host).hostname or ""
         if name in ("localhost", self.server.host.lower()) or (self.server.is_local and name in ("127.0.0.1", "::1")):
             return True
-        with contextlib.suppress(ValueError):  # a server on 0.0.0.0 has all addresses of this computer
-            return self.server.host in ("0.0.0.0", "::") and bool(ipaddress.ip_address(name))
+        if self.server.host not in ("0.0.0.0", "::"):
+            return False
+        own = socket.gethostname().lower()
+        with contextlib.suppress(ValueError):  # the server has all addresses of this computer
+            return name in (own, f"{own}.local") or bool(ipaddress.ip_address(name))
         return False
