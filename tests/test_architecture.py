@@ -13,11 +13,11 @@ ROOMS = [
     for name, paths, lines, budget in re.findall(r"^\| ([^|`]+) \| (`[^|]+) \| ([\d,]+) \| ([\d,]+) \|$", PAGE, re.M)
 ]
 TOTALS = {
-    "library without hardware": 26_330,
-    "hardware": 5_110,
-    "experiments": 7_280,
+    "library without hardware": 26_360,
+    "hardware": 5_130,
+    "experiments": 7_350,
     "benchmarks": 5_800,
-    "tests": 25_400,
+    "tests": 25_900,
 }
 
 

@@ -178,7 +178,7 @@ def test_the_recording_for_rerun_has_all_frames(made, tmp_path):
 
 def test_without_rerun_the_error_names_the_extra(made, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(ImportError, match=r"pip install 'sts_jax\[view\]'"):
+    with pytest.raises(ImportError, match=r"pip install -e '\.\[view\]'"):
         inspect.main(inspect.Config(str(made[0]), tmp_path / "page.html", rrd=Path("one.rrd")))
     assert not (tmp_path / "page.html").exists()  # the error comes before the work
 

@@ -19,7 +19,7 @@ def check_installed() -> None:
     try:
         import rerun  # noqa: F401
     except ImportError as error:
-        raise ImportError("--rrd needs the package rerun-sdk: pip install 'sts_jax[view]'") from error
+        raise ImportError("--rrd needs the package rerun-sdk: pip install -e '.[view]'") from error
 
 
 def write_rrd(path: Path, data: dataset.Dataset, trajectory: int) -> None:
