@@ -88,6 +88,9 @@ def test_an_experiment_takes_a_finished_dataset_of_another_computer(folder, tmp_
     )
     with pytest.raises(ValueError, match=message):
         run.main(dataclasses.replace(config, collection=other), tmp_path / "other", only="train", source=source)
+    run.main(config, tmp_path / "clear", only="train", source=source, skin="clear")  # the dataset has its own sensor
+    with pytest.raises(ValueError, match=r"collected with room\.\w+ = .*, but the current settings have"):
+        run.main(config, tmp_path / "clear", only="collect", source=source, skin="clear")
     dataset.collect(SMALL, sts.Sensor(), tmp_path / "again")
     with pytest.raises(ValueError, match="run/dataset is another dataset than"):
         run.main(config, tmp_path / "run", only="train", source=str(tmp_path / "again"))

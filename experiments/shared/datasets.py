@@ -63,18 +63,18 @@ def make(
     return collected
 
 
-def link(source: str, collection: dataset.Collection, sensor: sts.Sensor, folder: Path) -> dataset.Dataset:
+def link(source: str, collection: dataset.Collection, sensor: sts.Sensor | None, folder: Path) -> dataset.Dataset:
     """Make a folder a link to a finished dataset of a collection, or to the local copy of one behind a URL.
 
-    Only reads the dataset, so that several processes may use it at the same time.
+    Only reads the dataset, so that several processes may use it at the same time. None accepts any sensor.
     """
     data = dataset.load(source)
     place = data.shards[0].parent.resolve()
-    new, constants = json.loads(json.dumps([dataset.as_json(collection), sensor.constants()]))
-    old = {name: data.collection.get(name) for name in new}
-    changes = storage.differences(old, new, dataset.PLACES) or storage.differences(
-        json.loads((place / "sensor.json").read_text()), constants
-    )
+    new = json.loads(json.dumps(dataset.as_json(collection)))
+    changes = storage.differences({name: data.collection.get(name) for name in new}, new, dataset.PLACES)
+    if sensor is not None and not changes:
+        constants = json.loads(json.dumps(sensor.constants()))
+        changes = storage.differences(json.loads((place / "sensor.json").read_text()), constants)
     if changes:
         raise ValueError(
             f"the dataset {source} was collected with {changes}: give the options with which it was collected, or "

@@ -210,7 +210,8 @@ def main(
         storage.claim(workdir / "config.json", dataclasses.asdict(config), storage.default_fields(config), places)
         folder = workdir / "dataset"
         if source is not None:
-            data = link(source, config.collection, sensor(skin), folder)
+            collected = sensor(skin) if only in (None, "collect") else None  # later stages use that of the dataset
+            data = link(source, config.collection, collected, folder)
         elif only in (None, "collect"):
             data = collect(config.collection, sensor(skin), folder)
         else:

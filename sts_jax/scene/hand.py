@@ -21,9 +21,7 @@ BOX = (0.03, 0.04, 0.05)  # m, size of the object without a `Body`
 REACH = 0.15  # m, from the middle of the sensors up to the palm
 MAST = 0.3  # m, largest height of the middle of the sensors
 HAND_MASS, FINGER_MASS = 0.6, 0.1  # kg
-SLIPPERY = (
-    1e-5  # friction of the table, so that an object has its own: no friction makes NaN in MJX (C takes this value)
-)
+SLIPPERY = 1e-5  # friction of the table, so that the object's counts. Without any, MJX makes NaN (C takes this value)
 LIFT_GAINS = 2e4, 400.0  # N/m, N s/m, of the servo that lifts the hand: 22 Hz, critically damped with a full hand
 GRIP_GAINS = 4e3, 40.0  # N/m, N s/m, of the servo that closes the fingers, whose force is limited
 
