@@ -40,22 +40,36 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     Args:
         write: Function that writes the content to the path of a temporary file, which is then renamed to `path`.
     """
+    _write({path: write}, path)
+
+
+def write_together(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Write files of a folder in their order, each atomically. On a full disk, all of them keep their content."""
+    _write({folder / name: functools.partial(Path.write_bytes, data=data) for name, data in files.items()}, folder)
+
+
+def _write(writers: Mapping[Path, Callable[[Path], object]], name: Path) -> None:
+    """Write all files under temporary names, then rename them. `name` names them in error messages."""
     # A process on another host that shares the folder may have the same number.
-    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.partial")
+    mark = f"{os.getpid()}-{secrets.token_hex(4)}"
+    temporary = {path: path.with_name(f".{path.name}.{mark}.partial") for path in writers}
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write(temporary)
-        with temporary.open("rb") as file:
-            os.fsync(file.fileno())
-        temporary.replace(path)
+        for path, write in writers.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write(temporary[path])
+            with temporary[path].open("rb") as file:
+                os.fsync(file.fileno())
+        for path in writers:
+            temporary[path].replace(path)
     except OSError as error:
         raise OSError(
-            f"cannot write {path}: {error.strerror or error}. {remedy(error)}, then start again. All finished results "
+            f"cannot write {name}: {error.strerror or error}. {remedy(error)}, then start again. All finished results "
             "are kept."
         ) from error
     finally:
         with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
+            for path in writers:
+                temporary[path].unlink(missing_ok=True)
 
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -82,7 +96,12 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 def write_json(path: Path, content: Any) -> None:
     """Write an object, such as a dictionary or a list, to a JSON file atomically."""
-    write_bytes(path, (json.dumps(content, indent=2) + "\n").encode())
+    write_bytes(path, json_bytes(content))
+
+
+def json_bytes(content: Any) -> bytes:
+    """The content of a JSON file, indented."""
+    return (json.dumps(content, indent=2) + "\n").encode()
 
 
 def read_json(path: Path, remedy: str) -> Any:
@@ -245,6 +264,12 @@ class Manifest(NamedTuple):
     files: dict[str, str]  # SHA-256 in hexadecimal digits, by path relative to the folder
     facts: dict[str, Any]  # JSON values
 
+    @property
+    def content(self) -> bytes:
+        """The content of `manifest.json`."""
+        content = self._asdict()
+        return json_bytes({**content, "checksum": digest(content)})
+
 
 def checksums(folder: Path, names: Iterable[str]) -> dict[str, str]:
     """SHA-256 of some files of a folder, by their paths relative to the folder."""
@@ -262,9 +287,9 @@ def write_manifest(
         facts: Further JSON values.
         name: Name of a manifest of only some files of the folder.
     """
-    content = {"files": dict(files), "facts": dict(facts or {})}
-    write_json(folder / name, {**content, "checksum": digest(content)})
-    return Manifest(**content)
+    manifest = Manifest(dict(files), dict(facts or {}))
+    write_bytes(folder / name, manifest.content)
+    return manifest
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,7 +13,7 @@ ROOMS = [
     for name, paths, lines, budget in re.findall(r"^\| ([^|`]+) \| (`[^|]+) \| ([\d,]+) \| ([\d,]+) \|$", PAGE, re.M)
 ]
 TOTALS = {
-    "library without hardware": 26_360,
+    "library without hardware": 26_390,
     "hardware": 5_130,
     "experiments": 7_350,
     "benchmarks": 5_800,

@@ -3,6 +3,8 @@
 import dataclasses
 import json
 import re
+import shutil
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -55,6 +57,18 @@ def test_the_file_is_also_that_of_a_simulated_sensor(tmp_path):
         Device.load(tmp_path / "other")
 
 
+def test_on_a_full_disk_the_earlier_sensor_stays(small_disk):
+    folder, ballast, plain = small_disk / "bench", small_disk / "ballast", np.zeros_like(DARK)  # small files
+    DEVICE.save(folder, SENSOR, (plain, plain))
+    ballast.write_bytes(bytes(shutil.disk_usage(small_disk).free - 16384))  # room for one of the new images
+    with pytest.raises(OSError, match=r"cannot write .*bench: .*Free some disk space"):
+        dataclasses.replace(DEVICE, settle_on_s=0.06).save(folder, SENSOR, (DARK, LIT))
+    ballast.unlink()
+    assert Device.load(folder) == DEVICE
+    np.testing.assert_array_equal(DEVICE.backgrounds(folder), [plain, plain])
+    assert not list(folder.glob(".*partial"))
+
+
 def test_a_device_can_be_copied_and_saved_again_with_and_without_its_backgrounds(folder, tmp_path):
     assert hardware.copy_sensor(folder, tmp_path / "copy") == hardware.sensor_file.checksums(folder)
     slower = dataclasses.replace(DEVICE, settle_on_s=0.06)
@@ -78,8 +92,15 @@ def test_flipped_bits_and_truncated_missing_and_exchanged_files_are_named(folder
 
 
 def test_an_interrupted_first_write_is_noticed_and_repeated(tmp_path, monkeypatch):
+    rename = Path.replace
+
+    def interrupted(path, target):
+        if target.name == "manifest.json":
+            raise KeyboardInterrupt
+        rename(path, target)
+
     with monkeypatch.context() as patch:
-        patch.setattr(storage, "write_manifest", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(Path, "replace", interrupted)
         with pytest.raises(KeyboardInterrupt):
             DEVICE.save(tmp_path, SENSOR, (DARK, LIT))
     with pytest.raises(ValueError, match="incomplete"):

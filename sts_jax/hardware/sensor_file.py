@@ -4,6 +4,7 @@
 """
 
 import dataclasses
+import hashlib
 import io
 import os
 import shutil
@@ -88,16 +89,18 @@ class Device:
         file, shape, content = sensor_file(path), (self.lens.height, self.lens.width, 3), dataclasses.asdict(self)
         storage.decode(Device, content, "device")
         manifest = storage.read_manifest(file.parent, _AGAIN) if backgrounds is None else None
-        files = {} if manifest is None else manifest.files
+        written = {}
         for name, image in zip(BACKGROUNDS, backgrounds or (), strict=False):
             if image.shape != shape:
                 raise ValueError(f"a background has shape {image.shape}, but the lens {shape}")
             buffer = io.BytesIO()
             Image.fromarray(image).save(buffer, "PNG", compress_level=3)
-            storage.write_bytes(file.with_name(name), buffer.getvalue())
-            files |= storage.checksums(file.parent, [name])
-        storage.write_json(file, {**sensor.constants(), "device": content})
-        storage.write_manifest(file.parent, files | storage.checksums(file.parent, [file.name]))
+            written[name] = buffer.getvalue()
+        written[file.name] = storage.json_bytes({**sensor.constants(), "device": content})
+        checksums = {name: hashlib.sha256(data).hexdigest() for name, data in written.items()}
+        files = checksums if manifest is None else {**manifest.files, **checksums}
+        written[storage.MANIFEST] = storage.Manifest(files, {}).content
+        storage.write_together(file.parent, written)
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> "Device":
