@@ -84,9 +84,8 @@ def columns(names: dict[str, str]) -> list[evaluation.Column]:
     return [evaluation.Column(heading, (metrics[name],)) for heading, name in names.items()]
 
 
-def degraded(images: np.ndarray, args: Args) -> np.ndarray:
+def degraded(images: np.ndarray, args: Args, rng: np.random.Generator) -> np.ndarray:
     """Blur images, uint8 `(n, h, w, 3)`, then add noise, as `args` says."""
-    rng = np.random.default_rng(args.seed)
 
     def worse(image: np.ndarray) -> np.ndarray:
         blurred = cv2.GaussianBlur(image.astype(np.float32), (0, 0), args.blur) if args.blur else image
@@ -116,23 +115,27 @@ def main(args: Args) -> str:
     rows = evaluation.rows_of(data, "object")
     size = EXPERIMENTS[args.model].DEFAULT.image_size
     train, given = dataset.reduced(data.pairs(rows["train"]), size), data.pairs(rows["test"])
-    test = dataset.reduced(given, size)
     if args.noise or args.blur:
+        rng = np.random.default_rng(args.seed)
         for images in (given.visual, given.tactile):
-            images[:, 0] = degraded(images[:, 0], args)
+            images[:, 0] = degraded(images[:, 0], args, rng)
+    test = dataset.reduced(given, size)
     judge = evaluation.scorer(scenario, train)
     items = evaluation.figures.one_of_each(test, dataset.class_names(made), SHOWN)
     scores = {title: judge(row, test) for title, row in evaluation.baselines(scenario, train, test).items()}
     every = evaluation.subsets(predictor.modalities)
     subsets = {title: every[title] for title in (f"from {given}" for given in MAIN_SUBSETS) if title in every}
+    worse = [f"{name}{value:g}" for name, value in (("noise", args.noise), ("blur", args.blur)) if value]
+    worse += [] if args.trained is None else ["-".join(args.trained.parts[-3:])]
     with Bar() as bar:
         for number, (given_by, subset) in enumerate(subsets.items()):
             bar("predict", number, len(subsets), given_by)
             row = evaluation.predict(predictor, subset, given, scenario, num_samples=NUM_SAMPLES)
             scores[given_by] = judge(row, test)
             if given_by in PICTURES:
-                path, shown = folder.with_name(f"{folder.name}-{PICTURES[given_by]}.png"), evaluation.take(row, items)
-                title = f"{args.model}, {given_by}: new objects"
+                name = "-".join([folder.name, *worse, PICTURES[given_by]])
+                path, shown = folder.with_name(f"{name}.png"), evaluation.take(row, items)
+                title = f"{args.model}, {given_by}: {', '.join(['new objects', *worse])}"
                 drawing.draw_predictions(path, made, sensor, given.take(items), shown, title)
             del row  # gigabytes of samples
     notes = [

@@ -176,8 +176,14 @@ def main(config: Config) -> None:
     """Read the real and the simulated images, print how much they differ, and draw the figure."""
     if config.rows < 1:
         raise ValueError(f"--rows must be >= 1, got {config.rows}")
+    gap.check_installed()
     drawing.make_folder(config.out)
     real, simulated = load(config)
+    common = " in common" if config.match == "number" else ""
+    if (number := min(len(np.unique(side.group)) for side in (real, simulated))) < gap.FOLDS:
+        raise ValueError(
+            f"{config.real} and {config.simulated} must have at least {gap.FOLDS} trajectories{common}, got {number}"
+        )
     text = report(config, real, simulated)
     print(text)
     storage.write_bytes(config.out / "gap.txt", f"{text}\n".encode())

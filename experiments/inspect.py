@@ -64,6 +64,9 @@ def main(config: Config) -> None:
     terminal.check_numbers(config, num=(0, 1000), examine=(0, 10**9))
     if config.rrd is not None:
         viewing.check_installed()
+    for option, path in (("--out", config.out), ("--rrd", config.rrd)):
+        if path is not None and path.is_dir():
+            raise ValueError(f"{option} {path} is a folder: give the name of a file")
     data = open_dataset(config.dataset)
     number, count = config.trajectory, len(data.trajectory["outcome"])
     if number is not None and number not in data.rendered():

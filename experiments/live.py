@@ -32,7 +32,7 @@ import tyro
 import sts_jax as sts
 from experiments.shared import drawing, interrupts, terminal
 from experiments.shared.device import moving, own_twin
-from experiments.shared.live import Image, Live, Views, follow, panel
+from experiments.shared.live import Image, Live, Views, check_model, follow, panel
 from experiments.shared.page import LivePage
 from experiments.shared.terminal import say
 from sts_jax import hardware
@@ -89,6 +89,12 @@ def check(config: Config) -> None:
         raise ValueError("--replay excludes --record, --camera and --leds. To duplicate a recording, copy its folder")
     if config.sensor is None and (config.camera, config.leds) != (None, None):
         raise ValueError("--sensor is missing: give the sensor file of `experiments.commission`")
+    if (
+        config.record is not None
+        and config.record.exists()
+        and (not config.record.is_dir() or any(config.record.iterdir()))
+    ):
+        raise ValueError(f"--record {config.record} must be a new or an empty folder: give another name")
     if config.dwell < 1:
         raise ValueError(f"--dwell must be >= 1, got {config.dwell}")
     if config.seconds is not None and not config.seconds > 0:
@@ -182,6 +188,7 @@ def main(config: Config) -> None:
         check(config)
         sts.enable_compilation_cache()
         predictor = sts.Predictor.load(config.model)
+        check_model(predictor, config.condition)
         with contextlib.ExitStack() as stack:
             page, tell = None, say
             if not config.headless:

@@ -28,14 +28,14 @@ def test_no_object_is_shared_with_the_training_of_the_model():
 def test_worse_images_have_the_noise_and_the_blur_of_the_options():
     line = np.zeros((2, 32, 32, 3), np.uint8)
     line[:, :, 16] = 255
-    spread = shipped.degraded(line, shipped.Args("freefall", blur=1.5)).astype(float)
+    spread = shipped.degraded(line, shipped.Args("freefall", blur=1.5), np.random.default_rng(0)).astype(float)
     assert np.sum(spread[0, 8, :, 0] * (np.arange(32) - 16) ** 2) / np.sum(spread[0, 8, :, 0]) == pytest.approx(
         2.25, rel=0.05
     )
     grey = np.full((4, 64, 64, 3), 128, np.uint8)
-    noisy = shipped.degraded(grey, shipped.Args("freefall", noise=4)).astype(float)
+    noisy = shipped.degraded(grey, shipped.Args("freefall", noise=4), np.random.default_rng(0)).astype(float)
     assert (noisy.mean(), noisy.std()) == pytest.approx((128, np.sqrt(16 + 1 / 12)), rel=0.01)  # 1/12: rounding
-    assert np.array_equal(shipped.degraded(grey, shipped.Args("freefall")), grey)
+    assert np.array_equal(shipped.degraded(grey, shipped.Args("freefall"), np.random.default_rng(0)), grey)
 
 
 @pytest.mark.slow

@@ -387,7 +387,7 @@ def test_an_export_has_the_data_card_with_the_licence_of_the_objects(native, tmp
     assert (tmp_path / "of-run" / "README.md").read_text() == "licence: CC BY 4.0, from elsewhere\n"
 
 
-def test_another_export_or_folder_is_refused_and_the_same_export_is_kept(native, tmp_path):
+def test_another_export_or_folder_is_refused_and_the_same_export_is_kept(native, tmp_path, monkeypatch):
     folder, target = native[0], tmp_path / "out"
     target.mkdir()
     first = export.to_png(folder, target)
@@ -400,6 +400,7 @@ def test_another_export_or_folder_is_refused_and_the_same_export_is_kept(native,
     other = tmp_path / "other"
     other.mkdir()
     (other / "mine.txt").write_text("mine")
+    monkeypatch.setattr(export, "_planned", None)  # before the dataset is read
     with pytest.raises(FileExistsError, match=r"other exists, and is no finished export"):
         export.to_png(folder, other)
 

@@ -88,6 +88,7 @@ def test_an_experiment_takes_a_finished_dataset_of_another_computer(folder, tmp_
     )
     with pytest.raises(ValueError, match=message):
         run.main(dataclasses.replace(config, collection=other), tmp_path / "other", only="train", source=source)
+    run.main(config, tmp_path / "other", only="train", source=source)  # the wrong options did not claim the folder
     run.main(config, tmp_path / "clear", only="train", source=source, skin="clear")  # the dataset has its own sensor
     with pytest.raises(ValueError, match=r"collected with room\.\w+ = .*, but the current settings have"):
         run.main(config, tmp_path / "clear", only="collect", source=source, skin="clear")

@@ -168,6 +168,14 @@ def test_a_wrong_option_is_refused(options, message, tmp_path, monkeypatch, caps
             {"state_training": training.TrainConfig(steps=100, warmup=150, schedule="cosine")},
             r"state_training\.warmup must be smaller than state_training\.steps \(100\), got 150",
         ),
+        (
+            {
+                "model": "paper",
+                "steps": (150, 60, 60, 10),
+                "training": training.TrainConfig(warmup=15, schedule="cosine"),
+            },
+            r"training\.warmup must be smaller than the least of steps \(10\), got 15",
+        ),
         ({"rerolls": 0}, "rerolls must be >= 1, got 0"),
         ({"splits": ("frame",)}, r"splits must be one or more of object, trajectory, got \('frame',\)"),
         ({"splits": ()}, r"splits must be one or more of object, trajectory, got \(\)"),

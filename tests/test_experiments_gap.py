@@ -83,6 +83,13 @@ def test_a_rectified_image_is_reduced_to_its_centre():
     np.testing.assert_array_equal(command.centred(image, (64, 64)), np.full((64, 64, 3), 200, np.uint8))
 
 
+def test_missing_packages_are_named_before_any_work(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ImportError, match="pip install scikit-learn"):
+        command.main(config(folder, folder, tmp_path))
+    assert not (tmp_path / "out").exists()
+
+
 def test_bad_options_are_refused(folder, tmp_path):
     with pytest.raises(FileNotFoundError, match="holds no session"):
         command.load(config(tmp_path / "nothing", folder, tmp_path))
@@ -92,6 +99,8 @@ def test_bad_options_are_refused(folder, tmp_path):
         command.load(dataclasses.replace(config(folder, folder, tmp_path), resolution=(32, 64)))
     with pytest.raises(ValueError, match="rows must be >= 1, got 0"):
         command.main(config(folder, folder, tmp_path, rows=0))
+    with pytest.raises(ValueError, match=r"few must have at least 5 trajectories in common, got 3"):
+        command.main(config(folder, write(tmp_path / "few", range(3)), tmp_path))
     (tmp_path / "made").mkdir()
     (tmp_path / "made" / "collection.json").write_text("{}")
     with pytest.raises(ValueError, match="is a dataset"):

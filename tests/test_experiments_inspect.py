@@ -158,6 +158,11 @@ def test_a_wrong_trajectory_is_named(made):
         inspect.main(inspect.Config(str(made[0]), trajectory=20))
 
 
+def test_a_folder_is_no_page(made, tmp_path):
+    with pytest.raises(ValueError, match=r"--out .* is a folder: give the name of a file"):
+        inspect.main(inspect.Config(str(made[0]), tmp_path))
+
+
 def test_the_recording_for_rerun_has_all_frames(made, tmp_path):
     pytest.importorskip("rerun")
     from rerun.chunk import RrdReader

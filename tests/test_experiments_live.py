@@ -313,6 +313,7 @@ def test_a_sensor_file_without_backgrounds_is_refused(tmp_path):
         ({"seconds": 0.0}, "seconds must be > 0, got 0"),
         ({"dwell": 0}, "dwell must be >= 1, got 0"),
         ({"replay": "a", "record": "b"}, "--replay excludes --record"),
+        ({"record": Path(__file__).parent}, r"--record .*tests must be a new or an empty folder"),
         ({"save": Path("a.mp4")}, r"a\.mp4 must be the name of a picture that ends in one of \.png"),
     ],
 )

@@ -15,6 +15,7 @@ from experiments import table1
 from experiments.shared import cells, claims
 from experiments.shared.cells import Cell
 from experiments.shared.claims import Comparison, Estimate, Results, Side
+from experiments.shared.run import apart, with_epochs
 from sts_jax import evaluation, storage, training
 
 # Table 1 of the paper, row by row
@@ -104,6 +105,23 @@ def synthetic(levels, scenario="inclined", seeds=(0, 1, 2), objects=20, each=3):
         for stream in claims.STREAMS
     }
     return Results(scenario, np.repeat(np.arange(objects), each), seeds, found, references)
+
+
+def test_epochs_replace_the_steps_of_the_preset():
+    config = with_epochs(table1.DEFAULT, frozenset({"training.epochs"}))
+    assert (config.training.steps, config.state_training.steps) == (None, 300)
+    config = with_epochs(table1.DEFAULT, frozenset({"state-training.epochs", "state-training.steps"}))
+    assert (config.training.steps, config.state_training.steps) == (300, 300)
+
+
+@pytest.mark.parametrize("split", ["object", "trajectory"])
+def test_no_validation_trajectory_is_trained_on(split):
+    parts = {"train": np.arange(3, 40), "validation": np.arange(3, 40), "test": np.arange(40, 50)}
+    if split == "object":
+        parts["validation"] = np.arange(3)
+    used = apart(parts, split)
+    assert sorted(np.concatenate(list(used.values()))) == list(range(3 if split == "trajectory" else 0, 50))
+    assert len(used["validation"]) == (4 if split == "trajectory" else 3)
 
 
 def test_intervals_are_those_of_a_bootstrap_written_as_loops():
@@ -235,7 +253,7 @@ def workdir(tmp_path_factory):
     patch.setattr(
         cells, "train_model", lambda job, *args, **options: (trained.append(job.name), real(job, *args, **options))
     )
-    table1.main(FEW, workdir)
+    table1.main(dataclasses.replace(FEW, in_memory=False), workdir)  # as one may do after the memory was full
     patch.undo()
     assert sorted(trained) == sorted(cell.name for cell in cells.cells(FEW))  # each was trained once
     return workdir

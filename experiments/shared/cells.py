@@ -16,7 +16,7 @@ import sts_jax as sts
 from experiments.shared import config as common
 from experiments.shared.config import MODELS, TITLES
 from experiments.shared.evaluate import SEED, identity, record, stale
-from experiments.shared.run import Job, collect, train_model
+from experiments.shared.run import Job, apart, collect, train_model
 from experiments.shared.terminal import Bar
 from sts_jax import dataset, evaluation, storage, training
 from sts_jax._devices import cores
@@ -56,6 +56,7 @@ WEIGHTS = ("last", "best")  # weights of the last step, and those with the least
 REFERENCES = dict(zip(("constant", "copy", "ceiling"), (*evaluation.BASELINES[:2], evaluation.CEILING), strict=True))
 SCORED = tuple(m for m in evaluation.METRICS if m.name in ("visual_bce", "tactile_bce", "position_on_pad"))
 SELECTION = ("scenarios", "models", "scales", "seeds")
+FREE = (*SELECTION, "in_memory")  # fields that do not change a cell
 
 # Seconds on two cores of a 2.8 GHz Xeon, with images of 64 x 64 pixels: a gradient step of 16 samples of each of the
 # paper's models (with and without touch in the first frames) and of 32 samples of a state-space model, compilation and
@@ -94,7 +95,8 @@ class Config:
     prior: Literal["standard", "conditional"] = "standard"
     # held-out data: whole objects, or a random share of the trajectories (as in the paper)
     split: Literal["object", "trajectory"] = "object"
-    in_memory: bool = True  # read the frames of one-step trainings into memory. False: from the disk, batch by batch
+    # read the frames of one-step trainings into memory. False: from the disk, batch by batch. It may change, too
+    in_memory: bool = True
     num_validated: int = 4  # trajectories whose frames give the validation loss of the paper's one-step models
     moments: tuple[int, ...] = (0, 4, 12, 30)  # frames from which the one-step error is measured, besides the roll-out
     num_samples: int = 8  # samples of each prediction of a state-space model, whose mean image is scored
@@ -105,11 +107,6 @@ class Config:
         """The dataset of a scenario, with images of all frames."""
         chosen: dataset.Collection = getattr(self, scenario)
         return dataclasses.replace(chosen, num_full=chosen.num_trajectories, num_rendered=None)
-
-    @property
-    def claimed(self) -> dict:
-        """The fields that must stay the same in a work directory, as JSON values."""
-        return {name: value for name, value in dataclasses.asdict(self).items() if name not in SELECTION}
 
 
 class Cell(NamedTuple):
@@ -237,7 +234,7 @@ def scene(config: Config, name: str, sensor: sts.Sensor, workdir: Path) -> Scene
     """Collect the dataset of a scenario, or open it, and read the first and last frames of each part."""
     collection = config.collection(name)
     data = collect(collection, sensor, workdir / "datasets" / name)
-    rows = evaluation.rows_of(data, config.split)
+    rows = apart(evaluation.rows_of(data, config.split), config.split)
     train, validation, test = (data.pairs(rows[part]) for part in ("train", "validation", "test"))
     fitting = [t for t in config.moments if t + config.stride < collection.scenario.frames]
     moments = {t: data.pairs(rows["test"], frames=(t, t + config.stride)) for t in fitting}

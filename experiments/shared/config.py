@@ -254,9 +254,10 @@ def check(config: Config, own: Extensions = NONE) -> None:
                 f"steps must have one number for each model ({', '.join(MODELS['paper'])}), or be None for "
                 f"--training.epochs, got {config.steps}"
             )
-    trained, option = config.schedule, "state_training" if config.model == "statespace" else "training"
-    if trained.schedule == "cosine" and trained.steps is not None and trained.warmup >= trained.steps:
-        raise ValueError(f"{option}.warmup must be smaller than {option}.steps ({trained.steps}), got {trained.warmup}")
+    if config.model == "statespace":
+        check_warmup(config.state_training, "state_training")
+    else:
+        check_warmup(config.training, "training", config.steps)
     for name in ("num_shown", "num_samples", "rerolls", "num_rerolled"):
         if getattr(config, name) < 1:
             raise ValueError(f"{name} must be >= 1, got {getattr(config, name)}")
@@ -273,6 +274,13 @@ def check(config: Config, own: Extensions = NONE) -> None:
             f"measurements must be empty for model={config.model!r}, got the modality {own.measurements[0].name!r}: "
             "remove it, or use model='paper'"
         )
+
+
+def check_warmup(training: TrainConfig, option: str, steps: tuple[int, ...] | None = None) -> None:
+    """Raise a `ValueError` unless a warm-up is shorter than each training, of `steps` or else `training.steps`."""
+    name, each = (f"{option}.steps", training.steps) if steps is None else ("the least of steps", min(steps))
+    if training.schedule == "cosine" and each is not None and training.warmup >= each:
+        raise ValueError(f"{option}.warmup must be smaller than {name} ({each}), got {training.warmup}")
 
 
 def _check_parts(collection: dataset.Collection, split: str) -> None:

@@ -63,10 +63,10 @@ def make(
     return collected
 
 
-def link(source: str, collection: dataset.Collection, sensor: sts.Sensor | None, folder: Path) -> dataset.Dataset:
-    """Make a folder a link to a finished dataset of a collection, or to the local copy of one behind a URL.
+def finished(source: str, collection: dataset.Collection, sensor: sts.Sensor | None) -> dataset.Dataset:
+    """Open a finished dataset of a collection, or the local copy of one behind a URL. None accepts any sensor.
 
-    Only reads the dataset, so that several processes may use it at the same time. None accepts any sensor.
+    Only reads the dataset, so that several processes may use it at the same time.
     """
     data = dataset.load(source)
     place = data.shards[0].parent.resolve()
@@ -80,12 +80,17 @@ def link(source: str, collection: dataset.Collection, sensor: sts.Sensor | None,
             f"the dataset {source} was collected with {changes}: give the options with which it was collected, or "
             "another dataset"
         )
+    return data
+
+
+def link(data: dataset.Dataset, source: str, folder: Path) -> None:
+    """Make a folder a link to a dataset that was opened from `source`."""
+    place = data.shards[0].parent.resolve()
     if folder.is_symlink() or folder.exists():
         if folder.resolve() != place:
             raise ValueError(f"{folder} is another dataset than {source}: choose another work directory, or delete it")
     else:
         folder.symlink_to(place, target_is_directory=True)
-    return data
 
 
 def seconds(collection: dataset.Collection, sensor: sts.Sensor) -> tuple[float, float]:

@@ -166,6 +166,16 @@ class Views:
         return hardware.relit(view, background, model) if self.divided else view
 
 
+def check_model(predictor: sts.Predictor, condition: Sequence[float]) -> int:
+    """Check that a model sees and has a condition of this length, or that none is given. Returns its true length."""
+    if "visual" not in predictor.modalities:
+        raise ValueError(f"--model must take visual images as inputs: give another one than {predictor!r}")
+    width = predictor.model.config.condition
+    if len(condition) not in (0, width):
+        raise ValueError(f"--condition must have {width} values, got {len(condition)}, for {predictor!r}")
+    return width
+
+
 class Live:
     """Predicts the resting state in a background thread, always from the newest images.
 
@@ -178,11 +188,7 @@ class Live:
 
     def __init__(self, predictor: sts.Predictor, views: Views, condition: tuple[float, ...]):
         """Compile the model, and start the thread. An empty `condition` stands for zeros."""
-        if "visual" not in predictor.modalities:
-            raise ValueError(f"--model must take visual images as inputs: give another one than {predictor!r}")
-        width = predictor.model.config.condition
-        if len(condition) not in (0, width):
-            raise ValueError(f"--condition must have {width} values, got {len(condition)}, for {predictor!r}")
+        width = check_model(predictor, condition)
         self._predictor, self.views = predictor, views
         self._condition = np.asarray(condition or (0.0,) * width, np.float32) if width else None
         self._untouched = predictor.empty

@@ -13,7 +13,7 @@ import tyro
 
 import sts_jax as sts
 from experiments.shared.config import MODELS, NONE, Config, Extensions, Run, check
-from experiments.shared.datasets import collect, link
+from experiments.shared.datasets import collect, finished, link
 from experiments.shared.evaluate import evaluate
 from experiments.shared.terminal import Bar, on_one_line, say
 from sts_jax import dataset, evaluation, mvae, statespace, storage, training
@@ -23,7 +23,7 @@ from sts_jax.training import TrainConfig
 Stage = Literal["collect", "train", "evaluate"]
 Skin = Literal["hazy", "clear"]
 Preset = TypeVar("Preset")  # type of a configuration
-_CALIBRATING = 10  # of the training trajectories of a split by trajectory, every 10th calibrates the state-space model
+_VALIDATION = 10  # of the training trajectories of a split by trajectory, every 10th is for validation
 # Fields of the configuration that have no effect on the training of each kind of models
 WITHOUT_EFFECT = {
     "statespace": ("training", "steps", "targets", "encode_condition", "prior"),
@@ -92,12 +92,14 @@ def options(words: Sequence[str]) -> frozenset[str]:
 
 def with_epochs(config: Preset, given: frozenset[str]) -> Preset:
     """Drop the preset's numbers of gradient steps if the command line has the number of epochs or other steps."""
-    if {"training.epochs", "training.steps"} & given and "steps" not in given:
-        config = dataclasses.replace(config, steps=None)  # type: ignore[type-var]
-    if "state-training.epochs" in given and "state-training.steps" not in given:
-        state = dataclasses.replace(config.state_training, steps=None)  # type: ignore[attr-defined]
-        config = dataclasses.replace(config, state_training=state)  # type: ignore[type-var]
-    return config
+    changes: dict[str, object] = {}
+    if hasattr(config, "steps") and {"training.epochs", "training.steps"} & given and "steps" not in given:
+        changes["steps"] = None
+    for name in ("training", "state-training"):
+        if f"{name}.epochs" in given and f"{name}.steps" not in given:
+            field = name.replace("-", "_")
+            changes[field] = dataclasses.replace(getattr(config, field), steps=None)
+    return dataclasses.replace(config, **changes)  # type: ignore[type-var]
 
 
 def chosen_preset(
@@ -206,12 +208,14 @@ def main(
     """
     check(config, own)
     with storage.lock(workdir, finished=True):
+        if source is not None:  # a dataset that does not fit must not claim the work directory
+            collected = sensor(skin) if only in (None, "collect") else None  # later stages use that of the dataset
+            data = finished(source, config.collection, collected)
         places = [f"collection.{name}" for name in dataset.PLACES]
         storage.claim(workdir / "config.json", dataclasses.asdict(config), storage.default_fields(config), places)
         folder = workdir / "dataset"
         if source is not None:
-            collected = sensor(skin) if only in (None, "collect") else None  # later stages use that of the dataset
-            data = link(source, config.collection, collected, folder)
+            link(data, source, folder)
         elif only in (None, "collect"):
             data = collect(config.collection, sensor(skin), folder)
         else:
@@ -276,14 +280,23 @@ def jobs(
         yield Job(name, schedule, networks, arrays, preprocessing, empty)
 
 
+def apart(rows: Mapping[str, np.ndarray], split: str) -> dict[str, np.ndarray]:
+    """The trajectories of each part of a split, of which those for validation are not trained on.
+
+    A split by trajectory has no validation part of its own (`evaluation.rows_of`), so a part of the training is taken.
+    """
+    if split != "trajectory":
+        return dict(rows)
+    validation = rows["train"][::_VALIDATION]
+    return {**rows, "train": np.setdiff1d(rows["train"], validation), "validation": validation}
+
+
 def train(run: Run, data: dataset.Dataset, own: Extensions = NONE) -> None:
     """Train the models of one split, and show the progress. The state-space model is calibrated afterwards."""
     config, rows = run.config, evaluation.rows_of(data, run.split)
     state, falls = config.model == "statespace", None
-    train, validation = rows["train"], rows["validation"]
-    if state and run.split == "trajectory":  # in which the validation part is the training part
-        validation = train[::_CALIBRATING]
-        train = np.setdiff1d(train, validation)
+    used = apart(rows, run.split) if state else rows
+    train, validation = used["train"], used["validation"]
     if state:  # also those without images, but none that is held out
         falls = np.setdiff1d(data.members("train", rendered=False), np.union1d(rows["test"], validation))
     # The trajectories are passed without a variable of their own, so that `jobs` can free their memory.

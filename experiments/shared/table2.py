@@ -10,7 +10,7 @@ import tyro
 
 import sts_jax as sts
 from experiments.shared.collecting import Collect, collect
-from experiments.shared.config import MODELS, MOST, TITLES
+from experiments.shared.config import MODELS, MOST, TITLES, check_warmup
 from experiments.shared.evaluate import identity, record, stale
 from experiments.shared.run import Job, Stage, train_model
 from experiments.shared.terminal import Bar, say
@@ -102,6 +102,7 @@ def check(config: Config) -> None:
             raise ValueError(f"{name} must be >= {least} and <= {MOST}, got {getattr(config, name)}")
     for number in config.steps or ():
         dataclasses.replace(config.training, steps=number)  # raises an error for a number out of range
+    check_warmup(config.training, "training", config.steps)
     dataclasses.replace(config.training, seed=config.seed)
     if not 0 <= config.largest_shift < config.image_size:
         raise ValueError(f"largest_shift must be 0 to {config.image_size - 1} pixels, got {config.largest_shift}")

@@ -157,13 +157,14 @@ def _exported(
 ) -> Exported:
     """Write an export into a folder with another name, and rename it when it is complete."""
     place, target = local_or_remote(folder), Path(target).absolute()
+    taken = target.exists() and (not target.is_dir() or any(target.iterdir()))
+    if taken and not (target / RECORD).exists():
+        raise FileExistsError(f"{target} exists, and is no finished export: choose another folder, or delete it.")
     job = _planned(local_copy(place) if isinstance(place, Remote) else place, frames, progress)
     record = {"format": name, "frames": frames, "dataset": job.identity}
-    if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        recorded = read_json(target / RECORD, "choose another folder") if (target / RECORD).exists() else None
-        if recorded != record:
-            is_other = "has another export" if recorded is not None else "exists, and is no finished export"
-            raise FileExistsError(f"{target} {is_other}: choose another folder, or delete it.")
+    if taken:
+        if read_json(target / RECORD, "choose another folder") != record:
+            raise FileExistsError(f"{target} has another export: choose another folder, or delete it.")
         return job.exported
     partial = target.with_name(f".{target.name}.partial")
     with lock(partial):  # a second process is refused, and what a killed one has left is deleted

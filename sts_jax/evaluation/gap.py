@@ -5,6 +5,7 @@ number, which is the number of its trajectory. The two sets either have no group
 contain the same groups, and image i of both sets shows the same object in the same pose.
 """
 
+import importlib.util
 from typing import NamedTuple
 
 import cv2
@@ -137,6 +138,12 @@ def energy_distance(
     return Distance(value, (1 + above) / (1 + PERMUTATIONS))
 
 
+def check_installed() -> None:
+    """Raise an ImportError with the remedy if a package of `told_apart` is missing."""
+    if not all(map(importlib.util.find_spec, ("sklearn", "threadpoolctl"))):
+        raise ImportError("the classifier needs two packages: pip install scikit-learn threadpoolctl")
+
+
 def told_apart(
     real: np.ndarray, simulated: np.ndarray, real_group: np.ndarray, simulated_group: np.ndarray
 ) -> Estimate:
@@ -149,14 +156,13 @@ def told_apart(
 
     The arguments are those of `energy_distance`.
     """
-    try:
-        from sklearn.linear_model import LogisticRegression
-        from sklearn.model_selection import StratifiedGroupKFold
-        from sklearn.pipeline import make_pipeline
-        from sklearn.preprocessing import StandardScaler
-        from threadpoolctl import threadpool_limits
-    except ImportError as error:
-        raise ImportError("the classifier needs two packages: pip install scikit-learn threadpoolctl") from error
+    check_installed()
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.model_selection import StratifiedGroupKFold
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import StandardScaler
+    from threadpoolctl import threadpool_limits
+
     _matched(real, simulated, real_group, simulated_group, least=FOLDS)
     x, group = np.concatenate([real, simulated]), np.r_[real_group, simulated_group]
     is_real = np.arange(len(x)) < len(real)
