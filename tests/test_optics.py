@@ -8,6 +8,7 @@ import trimesh
 from optics_bodies import rays_hidden
 
 from sts_jax import optics
+from sts_jax.sensor import Sensor
 
 pytestmark = pytest.mark.usefixtures("strict_ranks")
 
@@ -59,6 +60,17 @@ def test_rays_are_the_inverse_of_projection(shape):
 def test_a_crop_is_the_square_around_the_projected_points(points, resolution, window):
     got = optics.object_window(CAMERA, jnp.asarray(points, jnp.float32), resolution)
     np.testing.assert_allclose(got, window, atol=1e-6)
+
+
+def test_a_crop_scales_with_the_sensor():
+    small, points = Sensor().sized(0.02), np.random.default_rng(0).uniform(-0.008, 0.008, (20, 3)).astype(np.float32)
+    points[:, 2] = np.abs(points[:, 2])
+    scale = 0.02 / 0.15
+    got = optics.object_window(small.camera, jnp.asarray(points * scale), (64, 64))
+    expected = optics.object_window(Sensor().camera, jnp.asarray(points), (64, 64))
+    np.testing.assert_allclose(got, scale * expected, rtol=1e-4, atol=1e-7)
+    dot = optics.object_window(small.camera, jnp.asarray(points * 1e-3), (64, 64))
+    np.testing.assert_allclose(dot[2:], 0.005 * scale, rtol=1e-5)
 
 
 PAD = (0.15, 0.15)  # m

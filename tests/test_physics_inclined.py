@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from sts_jax import objects, physics
 from sts_jax.physics import roll, scene
-from sts_jax.physics.scenario import STANDING, G
+from sts_jax.physics.scenario import STANDING, G, upright
 from sts_jax.sensor import Sensor
 
 SLOPE = np.radians(30)
@@ -40,6 +40,15 @@ def slide(friction: float, slope: float) -> roll.Record:
     flat = np.tile([0, 0, -G], (5, 2, STEPS, 1))
     gravity = np.concatenate([flat, np.tile(tilted[:, None, None], (1, 10, STEPS, 1))], axis=1)
     return jax.tree.map(np.asarray, ROLL(*block(friction), start, jnp.asarray(gravity, jnp.float32))[1])
+
+
+@pytest.mark.parametrize("degrees", [0.0, 1e-3, 0.01, 0.3, 0.757, 1.0, 30.0, 89.0, 91.0, 150.0, 180.0])
+@pytest.mark.parametrize("azimuth", [0.3, 2.0, 4.5])
+def test_faces_near_upside_down_are_laid_flat_too(degrees, azimuth):
+    lean = np.radians(degrees)
+    up = np.array([np.sin(lean) * np.cos(azimuth), np.sin(lean) * np.sin(azimuth), -np.cos(lean)])
+    turn = Rotation.from_quat(np.asarray(upright(jnp.asarray(up, jnp.float32))), scalar_first=True)
+    np.testing.assert_allclose(turn.apply(up), [0, 0, 1], atol=2e-5)
 
 
 @pytest.mark.slow

@@ -121,6 +121,16 @@ def test_without_equilibrium_the_result_is_unbalanced_and_within_the_limits(heig
     check_limits(got, height(*grid()))
 
 
+def test_32_bit_heights_in_64_bit_mode_have_the_same_balance():
+    make, wrench = next(iter(CASES.values()))
+    height = jnp.asarray(make(*grid()), jnp.float32)
+    expected = settle(GEL, height, wrench)
+    with jax.enable_x64(True):
+        got = tactile.settle(GEL, height, wrench)
+    assert bool(got.balanced)
+    np.testing.assert_allclose(got.pressure, expected.pressure, atol=1e-3 * float(expected.pressure.max()))
+
+
 def test_an_overloaded_tip_sinks_to_the_limit():
     x, y = grid()
     tip = np.where((abs(x) < 1e-3) & (abs(y) < 1e-3), 0.0, 0.02)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
+import sts_jax as sts
 from sts_jax import tactile
 
 pytestmark = pytest.mark.usefixtures("strict_ranks")
@@ -182,6 +183,28 @@ def test_shadows_equal_a_float64_loop(shape, lights):
     assert got.max() == 1
     for i, j in some_pixels(shape, 60):
         np.testing.assert_allclose(got[:, i, j], list(arriving(SKIN, lights, depth, i, j)), atol=5e-3)
+
+
+def test_a_pressed_part_shades_the_flat_skin_behind_it():
+    depth, light = np.zeros((96, 96)), jnp.array([[-1.0, 0.2, -0.1]])
+    depth[32:64, 32:44] = 0.002
+    sensors = [
+        sts.Sensor(lights=tactile.Lights(light, jnp.array([[strength] * 3])), skin=skin)
+        for strength, skin in ((0.4, SKIN), (0.4, tactile.Skin()), (0.0, SKIN))
+    ]
+    shaded, lit, dark = (np.asarray(sts.touch(s, depth, WINDOW))[..., 0].astype(float) for s in sensors)
+    shares = np.array([[next(arriving(SKIN, sensors[0].lights, depth, 48, j))] for j in range(46, 92)])[:, 0]
+    assert (shares == 0).any()
+    assert (shares == 1).any()
+    np.testing.assert_allclose((shaded - dark)[48, 46:92] / (lit - dark)[48, 46:92], shares, atol=0.02)
+
+
+def test_shadows_of_32_bit_depths_in_64_bit_mode():
+    depth, lights = jnp.asarray(pressed((20, 30)), jnp.float32), LEDS
+    expected = np.asarray(tactile.shadows(SKIN, lights, depth, jnp.asarray(WINDOW, jnp.float32)))
+    with jax.enable_x64(True):
+        got = tactile.shadows(SKIN, lights, depth, jnp.asarray(WINDOW))
+    np.testing.assert_allclose(got, expected, atol=1e-4)
 
 
 def test_zero_steps_and_flat_skin_give_no_shadows():

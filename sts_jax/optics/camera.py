@@ -42,7 +42,7 @@ def full_window(camera: Camera, resolution: tuple[int, int]) -> Float[Array, "4"
 
 
 def object_window(
-    camera: Camera, points: Float[Array, "v 3"], resolution: tuple[int, int], *, smallest: float = 0.005
+    camera: Camera, points: Float[Array, "v 3"], resolution: tuple[int, int], *, smallest: float | None = None
 ) -> Float[Array, "4"]:
     """Window (m) around an object (supplement of Rezaei-Shoshtari et al. 2021, "Training Details").
 
@@ -54,7 +54,8 @@ def object_window(
         camera: The camera.
         points: Points of the object in the sensor frame (m). Points nearer than `Camera.near` are ignored.
         resolution: Height and width of the image (pixels).
-        smallest: Smallest length of the window's shorter side (m).
+        smallest: Smallest length of the window's shorter side (m). None: a 30th of that of the full window, which are 5
+            mm of the default view.
     """
     full = full_window(camera, resolution)
     lower, size = full[:2], full[2:]
@@ -65,7 +66,8 @@ def object_window(
     last = jnp.max(jnp.where(ahead[:, None], seen, -jnp.inf), axis=0)
     in_view = jnp.all((first < lower + size) & (last > lower))
     first, last = jnp.clip(first, lower, lower + size), jnp.clip(last, lower, lower + size)
-    scale = jnp.max(jnp.maximum((last - first) / size, smallest / jnp.min(size)))
+    least = 1 / 30 if smallest is None else smallest / jnp.min(size)
+    scale = jnp.max(jnp.maximum((last - first) / size, least))
     side = size * jnp.minimum(scale, 1)
     corner = jnp.clip((first + last - side) / 2, lower, lower + size - side)
     return jnp.where(in_view, jnp.concatenate([corner, side]), full)

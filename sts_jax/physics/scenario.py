@@ -333,8 +333,10 @@ def fell_off(pose: Float[Array, "*n 7"]) -> Bool[Array, "*n"]:
 
 def upright(up: Float[Array, "3"]) -> Float[Array, "4"]:
     """Quaternion of the shortest rotation that turns a unit vector to +z."""
-    upside_down = up[2] < -0.9999
-    turn = jnp.stack([1 + up[2], up[1], -up[0], 0.0])
+    across = up[0] ** 2 + up[1] ** 2
+    upside_down = (up[2] < 0) & (across < 1e-10)  # within 1e-5 rad, where the axis is arbitrary
+    # 1 + z loses all digits near z = -1
+    turn = jnp.stack([jnp.where(up[2] < 0, across / (1 - up[2]), 1 + up[2]), up[1], -up[0], 0.0])
     return geometry.normalize(jnp.where(upside_down, jnp.array([0.0, 1.0, 0.0, 0.0]), turn))
 
 

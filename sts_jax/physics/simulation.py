@@ -156,9 +156,10 @@ def simulate(
 ) -> Trajectory:
     """Simulate `num` trajectories of each body with random starts and hidden properties.
 
-    Trajectory j of body i depends on `key`, i, j and the body, not on the number of other trajectories. A trajectory
-    that has non-finite values, or whose object sinks more than 5 mm into the pad or the stop wall, is drawn again with
-    another key (`Trajectory.resampled`).
+    Trajectory j of body i depends on `key`, i, j and the body, not on the number of other trajectories. In `Inclined`,
+    its start also depends on the largest number of stable faces of one of the bodies. A trajectory that has non-finite
+    values, or whose object sinks more than 5 mm into the pad or the stop wall, is drawn again with another key
+    (`Trajectory.resampled`).
 
     Args:
         key: Key of the whole set, from `jax.random.key`.

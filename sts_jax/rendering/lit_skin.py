@@ -32,9 +32,9 @@ def lit_skin(
     shares = tactile.shadows(sensor.skin, sensor.lights, imprint, window) if sensor.skin.shadow_steps else ()
     x, y = slopes[0][:, 1:-1] * sensor.camera.distance, slopes[1][1:-1] * sensor.camera.distance
     flat = jnp.stack(jnp.broadcast_arrays(x, y, jnp.zeros(())), axis=-1)
-    untouched = tactile.phong(
-        sensor.phong, sensor.lights, jnp.broadcast_to(jnp.array([[[0.0, 0.0, -1.0]]]), flat.shape), flat
-    )
+    normals = jnp.broadcast_to(jnp.array([[[0.0, 0.0, -1.0]]]), flat.shape)
+    arriving = shares[:, 1:-1, 1:-1] if len(shares) else None  # pressed parts also shade flat skin
+    untouched = tactile.phong(sensor.phong, sensor.lights, normals, flat, arriving)
     pressed = _near(imprint > _UNTOUCHED * sensor.gel.thickness)
     return where_active(_skin, pressed, sensor, (*slopes, imprint, *shares), planes(untouched), ring=1)
 

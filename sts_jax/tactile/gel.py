@@ -121,6 +121,8 @@ def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) ->
         the face, the centre of pressure lies outside its footprint or the pad, or the load is too large. The result
         then lies within the limits.
     """
+    precise = jnp.result_type(float)
+    heights, wrench = jnp.asarray(heights, precise), jnp.asarray(wrench, precise)
     force = wrench[2]
     pressed = force > 0
     safe_force = jnp.where(pressed, force, 1)

@@ -162,6 +162,7 @@ def shadows(
         Share of each light, from 0 (hidden) to 1 (fully visible). Ambient light (`Phong.ambient`) has no shadow.
     """
     rows, columns = depth.shape
+    depth = jnp.asarray(depth, jnp.result_type(float))
     pitch = window[2:] / jnp.array([columns, rows], jnp.float32)
     lengths = skin.shadow_reach * (jnp.arange(1, skin.shadow_steps + 1) / max(skin.shadow_steps, 1)) ** 2
     if isinstance(lights, Lights):
