@@ -226,8 +226,8 @@ class Predictor:
         `num_samples`, the result has the mean images and the central poses of the sampled courses.
 
         Args:
-            frame: First frame: a `Frame`, a `Prediction` of one frame, or a mapping with some of `visual`, `tactile`
-                and `pose`. Arrays and checks are those of a call.
+            frame: First frame: a `Frame`, a mapping with some of `visual`, `tactile` and `pose`, or for the paper's
+                models a `Prediction` of one frame. Arrays and checks are those of a call.
             steps: Number of steps, at least 1. A step takes `preprocessing.period` (s), which are `stride` frames.
             condition: Conditions as in a call. The time is added to them.
             time: Time of the first frame since frame 0 of its trajectory (s), for models with a condition.
@@ -570,9 +570,11 @@ def _located(folder: str | Path) -> Path:
     """The folder of a model, given as `Predictor.load` describes."""
     path, name = Path(folder), str(folder)
     names = sorted(config.parent.name for config in MODELS.glob("*/config.json"))
-    if name in names:
-        return MODELS / name
     models = sorted(config.parent for config in path.glob("models/*/config.json"))
+    # pathlib drops the dot of ./freefall
+    own = isinstance(folder, Path) and (models or (path / "config.json").exists())
+    if name in names and not own:
+        return MODELS / name
     if len(models) > 1:
         raise ValueError(f"{folder} has {len(models)} models: give one of {', '.join(map(str, models))}.")
     if models:

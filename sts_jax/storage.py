@@ -265,10 +265,9 @@ class Manifest(NamedTuple):
     facts: dict[str, Any]  # JSON values
 
     @property
-    def content(self) -> bytes:
-        """The content of `manifest.json`."""
-        content = self._asdict()
-        return json_bytes({**content, "checksum": digest(content)})
+    def content(self) -> dict[str, Any]:
+        """The content of `manifest.json`, with its checksum."""
+        return {**self._asdict(), "checksum": digest(self._asdict())}
 
 
 def checksums(folder: Path, names: Iterable[str]) -> dict[str, str]:
@@ -288,7 +287,7 @@ def write_manifest(
         name: Name of a manifest of only some files of the folder.
     """
     manifest = Manifest(dict(files), dict(facts or {}))
-    write_bytes(folder / name, manifest.content)
+    write_json(folder / name, manifest.content)
     return manifest
 
 

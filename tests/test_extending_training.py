@@ -75,6 +75,19 @@ def test_a_folder_is_not_resumed_with_another_loss_optimiser_or_note(tmp_path):
     assert run(optimiser=adam, notes=notes).step == 6
 
 
+def test_an_optimiser_with_a_random_key_is_resumed_with_the_same_noise(tmp_path):
+    def run(folder, **more):
+        noisy = optax.chain(optax.add_noise(0.01, 0.55, 0), optax.adam(1e-3))
+        return training.train(CONFIG, SMALL, arrays(), workdir=tmp_path / folder, optimiser=noisy, **more)
+
+    with pytest.raises(Killed):
+        run("killed", progress=kill_at(5))
+    whole, resumed = run("whole"), run("killed")
+    assert whole.step == resumed.step == 6
+    for one, other in zip(jax.tree.leaves(whole.state), jax.tree.leaves(resumed.state), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 def test_a_killed_run_with_its_own_parts_has_the_same_bits_and_each_call_logs_every_record_once(tmp_path):
     """Also records of earlier calls, so that a log that starts empty is complete wherever the run was killed."""
 

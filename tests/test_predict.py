@@ -368,7 +368,8 @@ def test_a_model_of_the_library_is_loaded_by_its_name(state_predictor, predictor
         sts.Predictor.load(tmp_path / "falls")
     predictor.save("falls")  # a model of the library comes first, unless the name has a slash
     assert sts.Predictor.load("falls").model.config == STATE
-    assert sts.Predictor.load("./falls").model.config == predictor.model.config
+    for own in ("./falls", pathlib.Path("./falls")):
+        assert sts.Predictor.load(own).model.config == predictor.model.config
 
 
 def test_the_work_directory_of_an_experiment_stands_for_its_only_model(state_predictor, predictor, tmp_path):

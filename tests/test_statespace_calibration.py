@@ -128,6 +128,18 @@ def test_a_calibration_is_fitted_again_only_if_it_is_damaged_or_the_data_differ(
         training.calibrate(folder, arrays())
 
 
+def test_a_calibration_of_older_weights_is_not_kept(folder, monkeypatch):
+    def meanwhile(*_, **__):
+        listed = storage.read_manifest(folder, "")
+        storage.write_manifest(folder, listed.files, {**listed.facts, "step": listed.facts["step"] + 1})
+        return NUMBERS
+
+    monkeypatch.setattr(statespace, "fit_calibration", meanwhile)
+    with pytest.raises(ValueError, match="was trained on while its calibration was fitted"):
+        training.calibrate(folder, arrays())
+    assert not (folder / "calibration.json").exists()
+
+
 @pytest.mark.parametrize("moment", [1, 2])
 def test_a_kill_while_a_calibration_is_written_leaves_a_valid_model(folder, monkeypatch, moment):
     training.save_calibration(folder, NUMBERS, STATE.inputs)

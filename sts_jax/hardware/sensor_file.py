@@ -99,7 +99,7 @@ class Device:
         written[file.name] = storage.json_bytes({**sensor.constants(), "device": content})
         checksums = {name: hashlib.sha256(data).hexdigest() for name, data in written.items()}
         files = checksums if manifest is None else {**manifest.files, **checksums}
-        written[storage.MANIFEST] = storage.Manifest(files, {}).content
+        written[storage.MANIFEST] = storage.json_bytes(storage.Manifest(files, {}).content)
         storage.write_together(file.parent, written)
 
     @classmethod

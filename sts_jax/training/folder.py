@@ -26,7 +26,7 @@ import os
 import shutil
 import tempfile
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -190,6 +190,7 @@ def save(folder: Path, state: TrainState, *, compact: bool = False) -> None:
         facts: dict[str, Any] = {**before.facts, "step": step}
         if log := _logged(folder, before, whole=True):
             facts["log"] = {"bytes": len(log), "sha256": hashlib.sha256(log).hexdigest()}
+        _flush(folder, [LOG, *new] if log else new)
         storage.write_manifest(folder, known | storage.checksums(folder, new), facts)
         kept = step
         (folder / CALIBRATION).unlink(missing_ok=True)
@@ -246,7 +247,11 @@ def read(folder: Path, step: int, like: TrainState) -> TrainState:
     for name in _plain(like._replace(optimiser=None)):
         if not np.isfinite(loaded[name]).all():
             raise ValueError(f"{path} has NaN or infinite weights in {name}: {_remedy(folder)}.")
-    return jax.tree.unflatten(jax.tree.structure(like), [loaded[name] for name in _plain(like)])
+    whole = [
+        jax.random.wrap_key_data(loaded[name], impl=jax.random.key_impl(leaf)) if _is_key(leaf) else loaded[name]
+        for name, leaf in zip(_plain(like), jax.tree.leaves(like), strict=True)
+    ]
+    return jax.tree.unflatten(jax.tree.structure(like), whole)
 
 
 def records(folder: Path) -> list[Record]:
@@ -468,6 +473,9 @@ def calibrate(workdir: str | os.PathLike[str], arrays: Arrays) -> Model:
         condition=arrays.condition,
     )
     with storage.lock(path):
+        listed = manifest(path)
+        if listed is None or listed.facts["step"] != model.step:
+            raise ValueError(f"{path} was trained on while its calibration was fitted: calibrate it again")
         save_calibration(path, calibration, model.config.inputs, checksum)
     return model._replace(calibration=calibration)
 
@@ -576,9 +584,19 @@ def _alone() -> ocp.Context:
 
 
 def _plain(state: TrainState) -> dict[str, Any]:
-    """The arrays of a state by their paths, so that the files do not depend on the classes of Flax and optax."""
+    """The arrays of a state by their paths, so that the files do not depend on the classes of Flax and optax.
+
+    The random keys of an optimiser become the numbers that they consist of.
+    """
     leaves, _ = jax.tree_util.tree_flatten_with_path(state)
-    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
+    return {
+        jax.tree_util.keystr(path, simple=True, separator="/"): jax.random.key_data(leaf) if _is_key(leaf) else leaf
+        for path, leaf in leaves
+    }
+
+
+def _is_key(leaf: Any) -> bool:
+    return jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def _parts(state: TrainState) -> dict[str, dict[str, Any]]:
@@ -587,6 +605,16 @@ def _parts(state: TrainState) -> dict[str, dict[str, Any]]:
     optimiser = {name: leaf for name, leaf in leaves.items() if name.startswith(f"{OPTIMISER}/")}
     weights = {name: leaf for name, leaf in leaves.items() if name not in optimiser}
     return {WEIGHTS: weights} if state.optimiser is None else {WEIGHTS: weights, OPTIMISER: optimiser}
+
+
+def _flush(folder: Path, names: Iterable[str]) -> None:
+    """Flush files to disk, so that a power failure leaves what the manifest will list."""
+    paths = [folder / name for name in names]
+    for path in paths:
+        with path.open("rb") as file:
+            os.fsync(file.fileno())
+    for parent in {parent for path in paths for parent in path.parents if parent.is_relative_to(folder)}:
+        storage.flush_folder(parent)
 
 
 def _first_line(error: Exception) -> str:

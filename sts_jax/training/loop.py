@@ -228,9 +228,10 @@ def train(
 ) -> Model:
     """Train a model in the folder `workdir`, or resume its training where an earlier call stopped.
 
-    On one machine, a training that was killed and resumed ends with the same bits as an uninterrupted training. If the
-    training in `workdir` has finished, the model is loaded and nothing is written. Only one process at a time can train
-    in a folder. A folder with other settings, data or optimiser is refused.
+    On the CPU of one machine, a training that was killed and resumed ends with the same bits as an uninterrupted one. A
+    GPU adds in no fixed order, unless XLA_FLAGS has `--xla_gpu_deterministic_ops=true`. If the training in `workdir`
+    has finished, the model is loaded and nothing is written. Only one process at a time can train in a folder. A folder
+    with other settings, data or optimiser is refused.
 
     Args:
         workdir: Folder of the model, see `sts_jax.training.folder` for its files.
