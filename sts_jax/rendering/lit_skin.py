@@ -29,14 +29,15 @@ def lit_skin(
     `window` is the part of the gel's face that the grid covers (m), and `slopes` are x / depth and y / depth. The
     outermost rows and columns, which have no normals, are dropped.
     """
-    shares = tactile.shadows(sensor.skin, sensor.lights, imprint, window) if sensor.skin.shadow_steps else ()
+    shares = tactile.shadows(sensor.skin, sensor.lights, imprint, window) if sensor.skin.shadow_steps else None
     x, y = slopes[0][:, 1:-1] * sensor.camera.distance, slopes[1][1:-1] * sensor.camera.distance
     flat = jnp.stack(jnp.broadcast_arrays(x, y, jnp.zeros(())), axis=-1)
     normals = jnp.broadcast_to(jnp.array([[[0.0, 0.0, -1.0]]]), flat.shape)
-    arriving = shares[:, 1:-1, 1:-1] if len(shares) else None  # pressed parts also shade flat skin
+    arriving = None if shares is None else shares[:, 1:-1, 1:-1]  # pressed parts also shade flat skin
     untouched = tactile.phong(sensor.phong, sensor.lights, normals, flat, arriving)
     pressed = _near(imprint > _UNTOUCHED * sensor.gel.thickness)
-    return where_active(_skin, pressed, sensor, (*slopes, imprint, *shares), planes(untouched), ring=1)
+    images = (*slopes, imprint) if shares is None else (*slopes, imprint, *shares)
+    return where_active(_skin, pressed, sensor, images, planes(untouched), ring=1)
 
 
 def passing(
