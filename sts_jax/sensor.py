@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
+from sts_jax._checked import in_32_bits
 from sts_jax._ranges import NOT_NEGATIVE, STATIC, limits
 from sts_jax.optics import Camera, Room
 from sts_jax.storage import DamagedFileError, digest, read_json, read_manifest, verify, write_json
@@ -236,6 +237,7 @@ def _require(conditions: Iterator[_Condition]) -> None:
 
 
 @functools.cache  # making its arrays takes a quarter of the time of a small image
+@in_32_bits
 def _default(kind: type[Sensor], lights: type[Lights | Leds], markers: bool) -> Sensor:
     """The default sensor with one kind of lights, with or without markers. Its arrays are not traced."""
     with jax.ensure_compile_time_eval():
