@@ -143,7 +143,7 @@ def sense(
             moving_edges=moving_edges,
             sound=sound,
         )._asdict()
-    if not is_traced(placed) and (problem := _problem(*placed, resolution)):  # JAX draws meanwhile
+    if not is_traced(placed) and (problem := placed_wrongly(*placed, resolution)):  # JAX draws meanwhile
         warn(problem)
     return Frame(**drawn)
 
@@ -173,7 +173,7 @@ def _check_shapes(number: int | None, pose: ArrayLike, wrench: ArrayLike | None)
             raise TypeError(f"parameter '{name}' has the shape {np.shape(value)}, but for {whose} it must be {shape}")
 
 
-def _problem(
+def placed_wrongly(
     sensor: Sensor, body: Body | Sequence[Body], pose: ArrayLike, wrench: ArrayLike | None, resolution: tuple[int, int]
 ) -> str | None:
     """What is probably wrong with a placement. Values that an accelerator still computes are not waited for."""

@@ -215,6 +215,20 @@ def test_ends_are_the_frame_of_sense(held):
 
 
 @pytest.mark.slow
+def test_an_object_that_fell_off_is_not_seen(held):
+    body, scene = held
+    fallen = twin.ObjectScene(body, resolution=(24, 32), seed=2)
+    fallen._motion(0)
+    beside, below = np.array([[0, -0.13, -0.07, 1, 0, 0, 0], [0, 0, -0.1, 1, 0, 0, 0]], np.float32)
+    blender = twin.Blender(PERFECT)
+    empty = fallen.ends(twin.Seen(twin.Phase.EMPTY, -1, 0, None), blender)
+    for number, pose in enumerate((beside, below)):
+        fallen._motions[number] = fallen._motions[0]._replace(pose=np.tile(pose, (60, 1)))
+        ends = fallen.ends(twin.Seen(twin.Phase.STILL, number, 59, tuple(pose.tolist())), blender)
+        np.testing.assert_array_equal(ends, empty)
+
+
+@pytest.mark.slow
 def test_another_object_is_held_from_the_next_hold_on():
     camera, fork = (sts.objects.make(jax.random.key(seed), name) for seed, name in ((0, "camera"), (5, "fork")))
     scene, blender, truths = twin.ObjectScene(camera, resolution=(24, 32), seed=2), twin.Blender(PERFECT), []

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sts_jax import physics
-from sts_jax.frame import sense
+from sts_jax.frame import placed_wrongly, sense
 from sts_jax.hardware.twin.photometry import Blender, Ends
 from sts_jax.objects import Body, make
 from sts_jax.sensor import Sensor
@@ -240,6 +240,8 @@ class ObjectScene(Scene):
         with self._working:
             ends = self._rendered.get((trajectory, frame))  # another thread may have rendered it meanwhile
             if ends is None:
+                if placed_wrongly(self.sensor, body, pose, None, self._resolution):  # it fell off, beside or below
+                    pose, wrench = _NOWHERE, np.zeros(6, np.float32)
                 state = jnp.asarray(pose), jnp.asarray(wrench)
                 images = sense(self.sensor, body, *state, resolution=self._resolution)
                 ends = blender.ends(np.asarray(images.visual), np.asarray(images.tactile))
