@@ -59,9 +59,10 @@ def session(folder: Path, sensor: Path | None, resolution: tuple[int, int]) -> g
     recordings = hardware.load_recordings(folder)
     if sensor is None:
         return streams(*recordings.images(lambda image: centred(image, resolution)))
-    lens = hardware.Device.load(sensor).lens
+    device = hardware.Device.load(sensor)
+    device.check_identity(leds=recordings.origin.leds)
     pinhole = sts.Sensor.load(hardware.sensor_file.sensor_file(sensor)).camera
-    return streams(*recordings.images(lambda image: hardware.rectified(lens, pinhole, image, resolution)))
+    return streams(*recordings.images(lambda image: hardware.rectified(device.lens, pinhole, image, resolution)))
 
 
 def simulated_dataset(folder: Path, resolution: tuple[int, int] | None) -> gap.Streams:
@@ -94,8 +95,16 @@ def chosen(images: gap.Streams, numbers: np.ndarray) -> gap.Streams:
     return gap.Streams(*(leaf[rows] for leaf in images))
 
 
+def check_size(size: tuple[int, int]) -> None:
+    """Refuse images that are too small to be compared."""
+    if min(size) < gap.LEAST_SIDE:
+        raise ValueError(f"--resolution must be at least {gap.LEAST_SIDE} x {gap.LEAST_SIDE}, got {size}")
+
+
 def load(config: Config) -> tuple[gap.Streams, gap.Streams]:
     """Read both sides. With `--match number`, they have the same trajectory numbers, otherwise none in common."""
+    if config.resolution is not None:
+        check_size(config.resolution)
     if (config.simulated / "collection.json").exists():
         if config.match == "number" or config.simulated_sensor is not None:
             raise ValueError(
@@ -106,8 +115,7 @@ def load(config: Config) -> tuple[gap.Streams, gap.Streams]:
     else:
         simulated = session(config.simulated, config.simulated_sensor, config.resolution or (240, 320))
     height, width = simulated.visual.shape[1:3]
-    if min(height, width) < gap.LEAST_SIDE:
-        raise ValueError(f"--resolution must be at least {gap.LEAST_SIDE} x {gap.LEAST_SIDE}, got {(height, width)}")
+    check_size((height, width))
     real = session(config.real, config.sensor, (height, width))
     if config.match == "none":
         return real, simulated._replace(group=simulated.group + real.group.max() + 1)

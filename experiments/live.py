@@ -38,6 +38,7 @@ from experiments.shared.terminal import say
 from sts_jax import hardware
 
 PRINT_S = 1.0  # time between two lines in the terminal, and between two moments of the picture (s)
+KEPT = 120  # moments in memory at which every second one is dropped
 ROWS = 6  # largest number of moments in the picture, which are chosen evenly
 
 
@@ -149,7 +150,7 @@ def images(config: Config, source: Source) -> Generator[hardware.Shot, None, Non
 def predict(config: Config, source: Source, predictor: sts.Predictor, page: LivePage | None) -> None:
     """Connect the source, and show and predict from its images until it ends or the user quits."""
     views = Views.load(source.file, divided=config.flat)
-    moments = list[Image]()
+    moments, number, every = list[Image](), 0, 1
     with (
         Live(predictor, views, config.condition) as live,
         source.sensor,
@@ -165,7 +166,12 @@ def predict(config: Config, source: Source, predictor: sts.Predictor, page: Live
                 if seen.predicted is not None and time.monotonic() > printed_s + PRINT_S:
                     printed_s = time.monotonic()
                     if config.save is not None:
-                        moments.append(panel(seen))
+                        if number % every == 0:
+                            moments.append(panel(seen))
+                        number += 1
+                        if len(moments) == KEPT:
+                            del moments[1::2]
+                            every *= 2
                     if page is None:
                         print(", ".join(seen.predicted.lines()), flush=True)
         except KeyboardInterrupt:

@@ -75,6 +75,9 @@ def test_raw_images_are_rectified_with_the_lens_of_the_sensor_file(folder, tmp_p
     raw = pair(3, "final", SIZE).tactile.image
     np.testing.assert_array_equal(real.tactile[7], hardware.rectified(lens, sts.Sensor().camera, raw, SIZE))
     np.testing.assert_array_equal(simulated.tactile[7], raw)
+    dataclasses.replace(device, leds="4567").save(tmp_path / "other", sts.Sensor())
+    with pytest.raises(ValueError, match=r"LED controller 4567, but the images are of .* LED controller 0123"):
+        command.load(config(folder, folder, tmp_path, simulated_sensor=tmp_path / "other"))
 
 
 def test_a_rectified_image_is_reduced_to_its_centre():

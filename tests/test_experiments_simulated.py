@@ -51,7 +51,7 @@ def test_an_interrupted_collection_of_the_twin_equals_an_uninterrupted_one(tmp_p
     real.main(Collect(parts, twin=True, count=5, **SMALL))
     assert "has 5 trajectories already" in capsys.readouterr().err
     for options, message in (
-        ({"seed": 1}, "TWIN1"),
+        ({"seed": 1}, "give --seed 0"),
         ({"size": (320, 240)}, "is for images of 240 x 180 pixels"),
     ):
         with pytest.raises(SystemExit, match=message):

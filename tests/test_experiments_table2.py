@@ -51,9 +51,11 @@ def test_trajectories_of_a_device_are_split_by_trajectory_and_read_in_the_order_
     assert table2.read(TINY, tmp_path / "work").identity != data.identity
 
 
-def test_the_source_of_a_twin_is_named(tmp_path):
-    record(tmp_path / "work", 5, leds="TWIN0")
+def test_the_source_of_a_twin_is_named_and_its_collection_continues_with_its_seed(tmp_path):
+    assert table2.twin_seed(tmp_path / "work") == 0
+    record(tmp_path / "work", 5, leds="TWIN31")
     assert table2.read(TINY, tmp_path / "work").source == "a digital twin"
+    assert table2.twin_seed(tmp_path / "work") == 31
 
 
 def test_missing_trajectories_and_sensor_files_are_errors_with_a_remedy(tmp_path):

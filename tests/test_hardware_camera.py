@@ -216,8 +216,8 @@ def test_faults_are_named_until_they_end(server, mode, error, message):
         assert after.time_s > before.time_s
 
 
-@pytest.mark.parametrize(("mode", "frozen_after_s"), [("repeat", None), ("black", 0.2)])
-def test_repeated_images_on_request_and_black_images_are_not_refused(server, mode, frozen_after_s):
+@pytest.mark.parametrize(("mode", "frozen_after_s"), [("repeat", None), ("black", 0.2), ("white", 0.2)])
+def test_repeated_images_on_request_and_black_or_white_images_are_not_refused(server, mode, frozen_after_s):
     with connected(server, frozen_after_s=frozen_after_s) as camera:
         assert not camera.read().black
         server.mode = mode
@@ -225,7 +225,7 @@ def test_repeated_images_on_request_and_black_images_are_not_refused(server, mod
         assert wait_until(lambda: camera.async_read().sequence > first.sequence + 60)  # longer than the default limit
         last = camera.read()
         assert np.array_equal(first.image, last.image)
-        assert (last.black, last.repeats > 20) == ((False, False) if mode == "repeat" else (True, True))
+        assert (last.black, last.repeats > 20) == (mode == "black", mode != "repeat")
 
 
 def test_disconnect_ends_a_read_in_another_thread(server):

@@ -243,6 +243,17 @@ def test_a_camera_of_another_backend_is_a_sensor(peer):
     assert not camera.is_connected
 
 
+def test_open_devices_are_connected_when_the_block_begins(peer):
+    with hardware.Leds.connect(peer.path) as leds:
+        camera = Backend(peer)
+        camera.connect()
+        with hardware.STS(camera=camera, leds=leds, settling=SETTLING) as sensor:
+            pair = sensor.read()
+            assert (pair.visual.image.max(), pair.tactile.image.min()) == (60, 160)
+            with sensor as same:
+                assert same is sensor
+
+
 def test_a_controller_that_returns_is_found_again_and_extends_the_limit(tmp_path, peer):
     given = config(peer.url, frozen_after_s=None)
     with hardware.STS(camera=given, leds=peer.path, settling=SETTLING, timeout_s=1.0).connect(0.2) as sensor:

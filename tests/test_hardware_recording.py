@@ -82,6 +82,17 @@ def test_the_videos_open_without_the_library(tmp_path, encoding):
         assert not video.read()[0]
 
 
+@pytest.mark.parametrize("encoding", ["ffv1", "mjpeg"])
+def test_images_of_the_same_millisecond_are_recorded(tmp_path, encoding):
+    times = [100.0, 100.1, 100.1002, 100.1002, 100.2]
+    with hardware.Recorder(tmp_path / "made", ORIGIN, encoding=encoding) as recorder:
+        for number, time_s in enumerate(times):
+            recorder.add(dataclasses.replace(shot(2 * number), time_s=time_s))
+    found = played(tmp_path / "made")
+    np.testing.assert_allclose([one.time_s - found[0].time_s for one in found], np.subtract(times, 100), atol=1e-6)
+    assert numbers(found) == [0, 2, 4, 6, 8]
+
+
 def test_an_interrupted_recording_ends_at_its_last_complete_image(interrupted):
     """Both files cut at many places, as if the process had been killed there."""
     video, lines = (interrupted / name for name in ("tactile.mkv", "frames.jsonl"))

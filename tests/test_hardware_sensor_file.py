@@ -112,7 +112,7 @@ def test_an_interrupted_first_write_is_noticed_and_repeated(tmp_path, monkeypatc
 def test_another_camera_or_controller_is_refused_by_name():
     DEVICE.check_identity()
     DEVICE.check_identity(camera=DEVICE.camera, leds=DEVICE.leds)
-    both = rf"camera {re.escape(DEVICE.camera)} and LED controller 1A2B3C4D, but the connected sensor has "
+    both = rf"camera {re.escape(DEVICE.camera)} and LED controller 1A2B3C4D, but the images are of "
     with pytest.raises(ValueError, match=both + r"camera /dev/video3 and LED controller 1A2B3C4D: load"):
         DEVICE.check_identity(camera="/dev/video3")
     with pytest.raises(ValueError, match=both + "camera /dev/video3 and LED controller FFFF"):
@@ -124,8 +124,14 @@ def test_passwords_of_urls_are_not_kept(tmp_path):
     assert "secret" not in (tmp_path / "sensor.json").read_text()
     loaded = Device.load(tmp_path)
     loaded.check_identity(camera="rtsp://other:word@camera/live")
-    with pytest.raises(ValueError, match=r"camera rtsp://camera/live .* has camera rtsp://elsewhere/live"):
+    with pytest.raises(ValueError, match=r"camera rtsp://camera/live .* of camera rtsp://elsewhere/live"):
         loaded.check_identity(camera="rtsp://user:secret@elsewhere/live")
+
+
+def test_a_password_with_an_at_sign_is_not_kept_either():
+    kept = ("http://camera:80/a@b", "rtsp://camera/live?user=me@home")
+    assert hardware.camera.public("http://user:p@ss@camera:80/a@b") == kept[0]
+    assert [hardware.camera.public(url) for url in kept] == list(kept)
 
 
 def load_edited(folder, **fields):

@@ -215,8 +215,19 @@ def test_ends_are_the_frame_of_sense(held):
 
 
 @pytest.mark.slow
+def test_two_cameras_see_the_same_scene_each_with_its_own_response(held):
+    _, scene = held
+    seen = twin.Seen(twin.Phase.EMPTY, -1, 0, None)
+    clean, dark = (twin.Blender(dataclasses.replace(PERFECT, vignetting=share)) for share in (0, 0.6))
+    own = [twin.ObjectScene(held[0], resolution=(24, 32)).ends(seen, blender) for blender in (clean, dark)]
+    for blender, ends in zip((clean, dark), own, strict=True):
+        np.testing.assert_array_equal(scene.ends(seen, blender), ends)
+    assert own[0].visual.mean() > 1.05 * own[1].visual.mean()
+
+
+@pytest.mark.slow
 def test_an_object_that_fell_off_is_not_seen(held):
-    body, scene = held
+    body, _ = held
     fallen = twin.ObjectScene(body, resolution=(24, 32), seed=2)
     fallen._motion(0)
     beside, below = np.array([[0, -0.13, -0.07, 1, 0, 0, 0], [0, 0, -0.1, 1, 0, 0, 0]], np.float32)

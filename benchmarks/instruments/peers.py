@@ -68,9 +68,9 @@ def jpeg(image: Image) -> bytes:
 class MotionJpeg:
     """A server of a motion JPEG stream. Its attribute `mode` selects a fault, and may change at any time.
 
-    `live`: numbered frames. `skip`: without the frames in `skipped`. `repeat`: the last frame again. `black`, `small`
-    (half the size), `damaged` (incomplete): such frames. `stall`: nothing. `held`: frames are kept and sent together
-    later. `close`: the stream ends. For new requests: `hang` (no answer), `missing` (404), `text` (no video).
+    `live`: numbered frames. `skip`: without the frames in `skipped`. `repeat`: the last frame again. `black`, `white`,
+    `small` (half the size), `damaged` (incomplete): such frames. `stall`: nothing. `held`: frames are kept and sent
+    together later. `close`: the stream ends. For new requests: `hang` (no answer), `missing` (404), `text` (no video).
     """
 
     def __init__(self, fps: float = 50, colour: tuple[int, int, int] | None = None, size: tuple[int, int] = SIZE):
@@ -153,8 +153,8 @@ class MotionJpeg:
             image = np.full((height, width, 3), self.colour, np.uint8)
             image[:16, :16] = 60 + self.number % 2 * 100
             return jpeg(image)
-        if mode == "black":
-            return jpeg(np.zeros((height, width, 3), np.uint8))
+        if mode in ("black", "white"):
+            return jpeg(np.full((height, width, 3), 255 * (mode == "white"), np.uint8))
         data = jpeg(draw(self.number, (width // 2, height // 2) if mode == "small" else self.size))
         return data[: len(data) // 2] if mode == "damaged" else data
 

@@ -251,6 +251,12 @@ def commissioned(config: Collect, device: twin.Twin) -> tuple[twin.VirtualSensor
     file, simulated = config.workdir / hardware.sensor_file.NAME, sts.Sensor()
     if file.exists():
         there = hardware.Device.load(file)
+        if there.camera == twin.CAMERA and there.leds != device.serial_number:
+            seed = there.leds.removeprefix("TWIN")
+            raise ValueError(
+                f"--seed is {config.seed}, but {config.workdir} is of a twin with another seed: give --seed {seed}, or "
+                "another --workdir"
+            )
         there.check_identity(camera=twin.CAMERA, leds=device.serial_number)
         if (there.lens.width, there.lens.height) != config.size:
             size = f"{there.lens.width} x {there.lens.height}"

@@ -80,7 +80,7 @@ def main(args: Train) -> None:
     sts.enable_compilation_cache()
     if args.only in (None, "collect") and (count := missing(config, workdir)):
         say(f"collect: {count} trajectories of the digital twin into {workdir / 'dataset'}")
-        collect(Collect(workdir, twin=True, count=config.count, size=config.size))
+        collect(Collect(workdir, twin=True, count=config.count, size=config.size, seed=twin_seed(workdir)))
     if args.only == "collect":
         return
     data = read(config, workdir)
@@ -116,6 +116,13 @@ def missing(config: Config, workdir: Path) -> int:
         return config.count
     recordings = hardware.load_recordings(workdir / "dataset")
     return max(config.count - len(recordings), 0) if recordings.origin.camera == twin.CAMERA else 0
+
+
+def twin_seed(workdir: Path) -> int:
+    """The seed of the twin whose sensor file a work directory has, or 0."""
+    exists = (workdir / hardware.sensor_file.NAME).exists()
+    number = hardware.Device.load(workdir).leds.removeprefix("TWIN") if exists else ""
+    return int(number) if number.isdecimal() else 0
 
 
 def read(config: Config, workdir: Path) -> Recorded:

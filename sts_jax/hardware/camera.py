@@ -137,7 +137,7 @@ class CameraConfig:
 
 def public(url: str) -> str:
     """Remove the user name and the password from a URL."""
-    return re.sub(r"(?<=://)[^/@]*@", "", url)
+    return re.sub(r"(?<=://)[^/?#]*@", "", url)
 
 
 class _Gap(NamedTuple):

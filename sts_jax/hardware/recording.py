@@ -81,6 +81,7 @@ class Recorder:
         self._encoding = encoding
         self._start_s: float | None = None  # time of the first image (s)
         self._videos: dict[Stream, tuple[av.container.OutputContainer, av.VideoStream]] = {}
+        self._last: dict[Stream, int] = {}  # time of the last image of each video (ms)
         self._open = True
         if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
             raise FileExistsError(f"{self.folder} is not an empty folder: give the name of a new folder.")
@@ -102,7 +103,9 @@ class Recorder:
         try:
             container, video = self._videos.get(shot.stream) or self._begin(shot.stream)
             frame = av.VideoFrame.from_ndarray(shot.image, format="rgb24").reformat(format=video.pix_fmt)
-            frame.pts = round(1000 * (shot.time_s - self._start_s))
+            # Encoders need increasing times. Those of `FRAMES` are exact.
+            frame.pts = max(round(1000 * (shot.time_s - self._start_s)), self._last.get(shot.stream, -1) + 1)
+            self._last[shot.stream] = frame.pts
             container.mux(video.encode(frame))
             pixels = zlib.crc32(shot.image.tobytes()) if self._encoding == "ffv1" else None
             facts = {"stream": shot.stream, **shot_facts(shot), "pixels": pixels}

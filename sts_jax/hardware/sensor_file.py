@@ -133,8 +133,8 @@ class Device:
         camera, leds = self.camera if camera is None else public(camera), leds or self.leds
         if (camera, leds) != (self.camera, self.leds):
             raise ValueError(
-                f"the sensor file describes camera {self.camera} and LED controller {self.leds}, but the connected "
-                f"sensor has camera {camera} and LED controller {leds}: load its own sensor file, or make one with "
+                f"the sensor file describes camera {self.camera} and LED controller {self.leds}, but the images are of "
+                f"camera {camera} and LED controller {leds}: load the sensor file of these, or make one with "
                 "`python -m experiments.commission`."
             )
 

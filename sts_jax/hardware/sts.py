@@ -242,7 +242,8 @@ class STS:
         self.camera.disconnect()
 
     def __enter__(self) -> "STS":
-        return self if self._leds is not None and self.camera.is_connected else self.connect()
+        connected = self._looks and self._leds is not None and self.camera.is_connected
+        return self if connected else self.connect()
 
     def __exit__(self, *error: object) -> None:
         self.disconnect()

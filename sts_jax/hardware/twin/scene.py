@@ -154,7 +154,8 @@ class ObjectScene(Scene):
         self._events: list[tuple[float, Phase, int]] = [(-float("inf"), Phase.EMPTY, first - 1)]
         self._batches = 0
         self._motions: list[_Motion] = []  # all trajectories so far, which take a few kilobytes each, and their bodies
-        self._rendered: dict[tuple[int, int], Ends] = {}  # images by trajectory and frame. (-1, 0) is the empty pad
+        # Images by camera, trajectory and frame. (-1, 0) is the empty pad
+        self._rendered: dict[tuple[Blender, int, int], Ends] = {}
         self._working = threading.Lock()  # lets one simulation or rendering run at a time
 
     def at(self, time_s: float) -> Seen:
@@ -195,7 +196,7 @@ class ObjectScene(Scene):
             raise ValueError(f"command is 'release', but the phase is '{phase}': send 'hold' first")
         self._events.append((time_s, *after[command]))
         del self._events[:-_EVENTS]
-        for key in [key for key in self._rendered if 0 <= key[0] < self._events[-1][2] - 1]:
+        for key in [key for key in self._rendered if 0 <= key[1] < self._events[-1][2] - 1]:
             del self._rendered[key]
 
     def choose(self, category: str, seed: int) -> None:
@@ -204,7 +205,7 @@ class ObjectScene(Scene):
         with self._working:
             self._body = body
             del self._motions[number + 1 :]
-            for key in [key for key in self._rendered if key[0] > number]:
+            for key in [key for key in self._rendered if key[1] > number]:
                 del self._rendered[key]
 
     def _motion(self, number: int) -> _Motion:
@@ -235,17 +236,17 @@ class ObjectScene(Scene):
         if trajectory >= 0:
             motion = self._motion(trajectory)
             body, pose, wrench = motion.body, motion.pose[frame], motion.wrench[frame]
-        if (ends := self._rendered.get((trajectory, frame))) is not None:
+        if (ends := self._rendered.get((blender, trajectory, frame))) is not None:
             return ends
         with self._working:
-            ends = self._rendered.get((trajectory, frame))  # another thread may have rendered it meanwhile
+            ends = self._rendered.get((blender, trajectory, frame))  # another thread may have rendered it meanwhile
             if ends is None:
                 if placed_wrongly(self.sensor, body, pose, None, self._resolution):  # it fell off, beside or below
                     pose, wrench = _NOWHERE, np.zeros(6, np.float32)
                 state = jnp.asarray(pose), jnp.asarray(wrench)
                 images = sense(self.sensor, body, *state, resolution=self._resolution)
                 ends = blender.ends(np.asarray(images.visual), np.asarray(images.tactile))
-                self._rendered[trajectory, frame] = ends
+                self._rendered[blender, trajectory, frame] = ends
             return ends
 
 
