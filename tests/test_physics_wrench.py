@@ -88,6 +88,18 @@ def test_a_site_and_its_pose_are_the_same_frame_and_move_the_moment():
         np.testing.assert_allclose(physics.wrench(m, d, "plane", frame), expected, atol=1e-5 * size)
 
 
+def test_a_body_that_sleeps_has_no_contacts_to_be_summed():
+    model = mujoco.MjModel.from_xml_string("""
+    <mujoco><option><flag sleep="enable"/></option><worldbody><geom name="pad" type="plane" size="1 1 1"/>
+    <body pos="0 0 .0201"><freejoint/><geom type="box" size=".01 .01 .02" mass=".1"/></body></worldbody></mujoco>""")
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 50)
+    np.testing.assert_allclose(physics.wrench(model, data, "pad")[2], 0.981, rtol=0.01)
+    mujoco.mj_step(model, data, 1950)
+    with pytest.raises(ValueError, match="sleeping bodies"):
+        physics.wrench(model, data, "pad")
+
+
 def test_the_moment_has_a_gradient_in_the_frame():
     model, data = moving("elliptic", 3)
     m, d = mjx.put_model(model), mjx.put_data(model, data)

@@ -59,8 +59,8 @@ def crowd() -> tuple[mujoco.MjModel, mujoco.MjData]:
 def test_wrenches_equal_those_of_the_contacts_in_both_engines(crowd):
     model, data = crowd
     view = scene.View(model, {"floor": SENSOR, "pad": SENSOR})
-    mjx_model = mjx.put_model(model)
-    in_mjx = jax.jit(mjx.forward)(mjx_model, mjx.put_data(model, data))
+    mjx_model, forward = mjx.put_model(model), jax.jit(mjx.forward)
+    in_mjx = forward(mjx_model, mjx.put_data(model, data))
     for m, d in ((model, data), (mjx_model, in_mjx)):
         wrenches = view.wrenches(d)
         for pad, objects in (("floor", ("ball_floor", "block_floor")), ("pad", ("ball_tip", "block_tip"))):
@@ -69,6 +69,29 @@ def test_wrenches_equal_those_of_the_contacts_in_both_engines(crowd):
             for name, mass in zip(objects, (0.1, 0.2), strict=True):
                 np.testing.assert_allclose(felt[name][2], mass * G, rtol=0.02)
             assert all(not np.any(wrench) for name, wrench in felt.items() if name not in objects)
+    for depth in (0.002, 0.0045, 0.006, 0.0095):  # of a gel of 5 mm
+        deep = mujoco.MjData(model)
+        deep.qpos[:] = data.qpos - depth * np.tile([0, 0, 1, 0, 0, 0, 0], 4)
+        mujoco.mj_forward(model, deep)
+        for m, d in ((model, deep), (mjx_model, forward(mjx_model, mjx.put_data(model, deep)))):
+            for pad, felt in view.wrenches(d).items():
+                np.testing.assert_allclose(sum(felt.values()), physics.wrench(m, d, pad, pad), rtol=1e-4, atol=1e-3)
+                assert sum(felt.values())[2] > 10
+
+
+def test_a_ball_that_falls_deep_into_a_soft_pad_is_pushed_out_at_every_moment():
+    small = sts.Sensor.sized(0.04)
+    spec = specification('<body pos="0 0 .04"><freejoint/><geom type="sphere" size=".02" mass=".1" condim="6"/></body>')
+    scene.attach(spec, "floor", small, name="pad", press=scene.Press(force=5.0, area=4e-4, mass=0.1))
+    model = spec.compile()
+    view, data, deepest = scene.View(model, {"pad": small}), mujoco.MjData(model), 0.0
+    for _ in range(120):
+        mujoco.mj_step(model, data)
+        mujoco.mj_forward(model, data)
+        felt = view.wrenches(data)["pad"]["body 1"]
+        np.testing.assert_allclose(felt, physics.wrench(model, data, "pad", "pad"), rtol=1e-4, atol=1e-4)
+        deepest = min(deepest, *data.contact.dist, 0.0)
+    assert deepest < -1.9 * float(small.gel.thickness)
 
 
 def test_a_block_on_a_tilted_pad_is_held_by_friction():

@@ -231,6 +231,10 @@ def test_each_finger_sees_the_other_one_but_not_itself(gripper):
     np.testing.assert_allclose(frame.depth[frame.body == alone.bodies.index("right")].min(), 0.1 + 0.1, atol=1e-6)
 
 
+def test_the_pad_of_another_view_is_seen(gripper):
+    assert scene.View(gripper[0], {"left": SMALL}, groups=[5]).bodies == ("right",)
+
+
 def test_bodies_and_geoms_can_be_hidden(objects):
     view = scene.View(objects[0], {"pad": SENSOR}, hide=["wire", "sheet", "egg"])
     assert view.bodies == ("ball", "rod", "can", "block")

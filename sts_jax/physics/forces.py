@@ -49,6 +49,8 @@ def wrench(
 
 def _c_forces(model: mujoco.MjModel, data: mujoco.MjData, geoms: Int[np.ndarray, "k"]) -> tuple[Any, Any, Any]:
     """Signs (0 for contacts that do not count), contacts, and forces on their second geom in the contact's frame."""
+    if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP and (data.tree_asleep >= 0).any():
+        raise ValueError("data has sleeping bodies, whose contacts MuJoCo does not keep: remove <flag sleep='enable'/>")
     given = np.isin(data.contact.geom, geoms)
     sign = given[:, 0].astype(float) - given[:, 1]
     local = np.zeros((data.ncon, 6))

@@ -34,6 +34,7 @@ class _Contacts(NamedTuple):
 
     places: Int[np.ndarray, "s 17"]  # indices into `sensordata`
     bodies: Int[np.ndarray, "s"]  # body on the other side of each contact
+    signs: Float[np.ndarray, "s"]  # -1 where the normal that C MuJoCo stores points into the pad
 
 
 class _Pad(NamedTuple):
@@ -137,10 +138,10 @@ class View:
         if not all(1 <= side <= MOST_PIXELS for side in resolution):
             raise ValueError(f"resolution (height, width) must be from 1 to {MOST_PIXELS:,} pixels, got {resolution}")
         given = self._given(wrenches)
-        arrays, frames = self._read(data), {}
+        arrays, frames, by_c = self._read(data), {}, isinstance(data, mujoco.MjData)
         for name, pad in self._pads.items():
             poses = _poses(arrays, pad.site, pad.bodies)
-            felt = _felt(arrays, pad, pad.bodies) if given is None else given[name]
+            felt = _felt(arrays, pad, pad.bodies, by_c=by_c) if given is None else given[name]
             drawn = draw_group(pad.sensor, pad.group, poses, felt, resolution=resolution)
             body = jnp.where(drawn.body < 0, -1, jnp.asarray(pad.names)[drawn.body])
             frames[name] = Frame(**drawn._replace(body=body)._asdict())
@@ -150,10 +151,10 @@ class View:
     @checked
     def wrenches(self, data: mujoco.MjData | mjx.Data) -> dict[str, dict[str, Float[Array, "6"]]]:
         """Force (N) and moment (N m) that each sensor exerts on each body that can touch it, in the sensor frame."""
-        arrays, wrenches = self._read(data), {}
+        arrays, wrenches, by_c = self._read(data), {}, isinstance(data, mujoco.MjData)
         for name, pad in self._pads.items():
             bodies = np.unique(pad.contacts.bodies)
-            rows = zip(bodies.tolist(), _felt(arrays, pad, bodies), strict=True)
+            rows = zip(bodies.tolist(), _felt(arrays, pad, bodies, by_c=by_c), strict=True)
             wrenches[name] = {self._names[body]: row for body, row in rows}
         return wrenches
 
@@ -208,15 +209,16 @@ class _Arrays(NamedTuple):
 def _poses(arrays: _Arrays, site: Int[Array, ""], bodies: Int[Array, "k"]) -> Float[Array, "k 7"]:
     """Poses of bodies in a sensor frame."""
     turn = arrays.site_xmat[site]
-    position = (arrays.xpos[bodies] - arrays.site_xpos[site]) @ turn
+    position = jnp.matmul(arrays.xpos[bodies] - arrays.site_xpos[site], turn, precision="highest")
     inverse = geometry.quat_inverse(geometry.quat_from_matrix(turn))
     return jnp.concatenate([position, geometry.quat_multiply(inverse, arrays.xquat[bodies])], axis=1)
 
 
-def _felt(arrays: _Arrays, pad: _Pad, bodies: Int[np.ndarray, "k"]) -> Float[Array, "k 6"]:
+def _felt(arrays: _Arrays, pad: _Pad, bodies: Int[np.ndarray, "k"], *, by_c: bool) -> Float[Array, "k 6"]:
     """Wrenches that a pad exerts on bodies, in the sensor frame."""
     counts = pad.contacts.bodies[None, :] == bodies[:, None]
-    return _wrenches(arrays, pad.site, pad.contacts.places, counts, pad.sensor.gel.thickness)
+    signs = pad.contacts.signs if by_c else None
+    return _wrenches(arrays, pad.site, pad.contacts.places, counts, signs, pad.sensor.gel.thickness)
 
 
 @jax.jit
@@ -225,19 +227,39 @@ def _wrenches(
     site: Int[Array, ""],
     places: Int[Array, "s 17"],
     counts: Bool[Array, "k s"],
+    signs: Float[Array, "s"] | None,
     thickness: Float[Array, ""] | float,
 ) -> Float[Array, "k 6"]:
     contact = arrays.sensordata[places]
+    distance = contact[:, 7]
     force, torque, point, normal, tangent = (contact[:, k : k + 3] for k in (1, 4, 8, 11, 14))
     turn = arrays.site_xmat[site]
-    frame = jnp.stack([normal, tangent, jnp.cross(normal, tangent)], axis=1) @ turn
-    point = (point - arrays.site_xpos[site]) @ turn
-    # A normal points from one geom to the other, but MJX 3.17 swaps the two for some pairs of types. Out of the pad is
-    # away from a point deep inside it.
-    inside = jnp.array([0.0, 0.0, -0.9]) * thickness
-    outward = jnp.sign(jnp.sum((point - inside) * frame[:, 0], axis=1))
-    force, torque = (jnp.einsum("s,si,sij->sj", outward, part, frame) for part in (force, torque))
-    return counts.astype(jnp.float32) @ jnp.concatenate([force, jnp.cross(point, force) + torque], axis=1)
+    frame = jnp.matmul(jnp.stack([normal, tangent, jnp.cross(normal, tangent)], axis=1), turn, precision="highest")
+    point = jnp.matmul(point - arrays.site_xpos[site], turn, precision="highest")
+    if signs is None:
+        signs = _outward(point, frame[:, 0], distance, thickness)
+    force, torque = (jnp.einsum("s,si,sij->sj", signs, x, frame, precision="highest") for x in (force, torque))
+    return jnp.matmul(
+        counts.astype(jnp.float32),
+        jnp.concatenate([force, jnp.cross(point, force) + torque], axis=1),
+        precision="highest",
+    )
+
+
+def _outward(
+    point: Float[Array, "s 3"],
+    normal: Float[Array, "s 3"],
+    distance: Float[Array, "s"],
+    thickness: Float[Array, ""] | float,
+) -> Float[Array, "s"]:
+    """1 where a normal points out of the pad, and -1 where it points into it. The data of MJX 3.17 have both.
+
+    Out of the pad is away from a point deep inside it. What sinks in nearly as deep as the gel is thick, comes from
+    above: the finger is below.
+    """
+    inside = jnp.where(distance > -0.8 * thickness, -0.9 * thickness, point[:, 2] - thickness / 2)
+    away = point.at[:, 2].add(-inside)
+    return jnp.sign(jnp.sum(away * normal, axis=1))
 
 
 def _pad_geom(model: mujoco.MjModel, name: str, sensor: Sensor) -> int:
@@ -333,21 +355,29 @@ def _touchable(model: mujoco.MjModel, pad: int) -> Int[np.ndarray, "k"]:
 
 def _sensors(model: mujoco.MjModel, pad: int) -> Iterator[tuple[int, int]]:
     """Geoms on the other side of the contact sensors of a pad, with the numbers of these sensors."""
-    kind = (model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT) & (model.sensor_objtype == _GEOM)
-    kind &= (model.sensor_reftype == _GEOM) & (model.sensor_intprm[:, :2] == [DATA, BY_DISTANCE]).all(axis=1)
-    for sensor in np.flatnonzero(kind):
+    for sensor in _contact_sensors(model):
         one, other = int(model.sensor_objid[sensor]), int(model.sensor_refid[sensor])
         if pad in (one, other):
             yield (other if pad == one else one), int(sensor)
 
 
+def _contact_sensors(model: mujoco.MjModel) -> Int[np.ndarray, "n"]:
+    kind = (model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT) & (model.sensor_objtype == _GEOM)
+    kind &= (model.sensor_reftype == _GEOM) & (model.sensor_intprm[:, :2] == [DATA, BY_DISTANCE]).all(axis=1)
+    return np.flatnonzero(kind)
+
+
 def _contacts(model: mujoco.MjModel, pad: int) -> _Contacts:
     places, bodies = [np.zeros((0, _CONTACT), int)], [np.zeros(0, int)]
+    signs = [np.zeros(0, np.float32)]
     for other, sensor in dict(_sensors(model, pad)).items():
         start, length = model.sensor_adr[sensor], model.sensor_dim[sensor]
-        places.append((start + np.arange(length)).reshape(-1, _CONTACT))
-        bodies.append(np.full(length // _CONTACT, model.geom_bodyid[other]))
-    return _Contacts(np.concatenate(places), np.concatenate(bodies))
+        slots = length // _CONTACT
+        places.append((start + np.arange(length)).reshape(slots, _CONTACT))
+        bodies.append(np.full(slots, model.geom_bodyid[other]))
+        # The normal points from the sensor's first geom to the second one.
+        signs.append(np.full(slots, 1 if model.sensor_objid[sensor] == pad else -1, np.float32))
+    return _Contacts(*map(np.concatenate, (places, bodies, signs)))
 
 
 def _without_housing(sensor: Sensor) -> Sensor:
@@ -367,7 +397,8 @@ def _seen(
     numbers = {_body_name(model, body): body for body in range(model.nbody)}
     _check_names(model, numbers, bodies, hide, pads)
     owner = model.geom_bodyid
-    shown = np.union1d(visible(model, groups), list(pads.values()))
+    every = np.union1d(list(pads.values()), model.sensor_objid[_contact_sensors(model)])  # those of other views, too
+    shown = np.union1d(visible(model, groups), every)
     shown = np.array([g for g in shown if not {model.geom(g).name, _body_name(model, owner[g])} & {*hide}], int)
     replaced = {numbers[name]: body for name, body in bodies.items() if name not in hide}
     made: dict[tuple[int, ...], Body] = {}
