@@ -101,7 +101,13 @@ def write_json(path: Path, content: Any) -> None:
 
 def json_bytes(content: Any) -> bytes:
     """The content of a JSON file, indented."""
-    return (json.dumps(content, indent=2) + "\n").encode()
+    return (json.dumps(content, indent=2, default=_plain) + "\n").encode()
+
+
+def _plain(number: Any) -> Any:
+    if isinstance(number, np.generic):
+        return number.item()
+    raise TypeError(f"a {type(number).__name__} cannot be written as JSON")
 
 
 def read_json(path: Path, remedy: str) -> Any:
@@ -190,12 +196,12 @@ def claim(path: Path, content: dict, defaults: dict | None = None, ignored: Sequ
     lacks, because an older version wrote it, counts as equal to its default in `defaults`, from `default_fields`. The
     dotted names in `ignored` may differ.
     """
-    content = json.loads(json.dumps(content))
+    content = json.loads(json_bytes(content))
     if not path.exists():
         write_json(path, content)
         return
     recorded = read_json(path, f"delete {path.parent}, or choose another folder")
-    old = _filled(recorded, content, json.loads(json.dumps(defaults or {})))
+    old = _filled(recorded, content, json.loads(json_bytes(defaults or {})))
     if changes := differences(old, content, ignored):
         raise ValueError(
             f"{path} was made with {changes}: choose another folder, or delete {path.parent} to start again."
@@ -251,7 +257,7 @@ def sha256(path: Path) -> str:
 
 def digest(content: Any) -> str:
     """SHA-256 of an object of JSON types, in hexadecimal digits, independent of the order of its keys."""
-    plain = json.loads(json.dumps(content))
+    plain = json.loads(json_bytes(content))
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 
 

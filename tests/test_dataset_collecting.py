@@ -419,6 +419,7 @@ def test_the_work_directory_of_an_experiment_stands_for_its_dataset(folder, tmp_
         (lambda at: dataset.load(at).pairs([True, False]), ValueError, r"has the type bool.* np\.flatnonzero\(mask\)"),
         (lambda at: dataset.load(at).views("all"), ValueError, "unknown part 'all'"),
         (lambda at: dataset.load(at / "collection.json"), NotADirectoryError, r"is a file: give the folder"),
+        (lambda at: dataset.load(at, shards=[]), ValueError, r"shards is empty, but .* has the shards 0 to \d+: name"),
         (lambda at: dataset.load(at / "no"), FileNotFoundError, r"no is not a collected dataset"),
     ],
 )

@@ -1,12 +1,30 @@
 import dataclasses
+import inspect
+import types
 
 import numpy as np
 import pytest
 
 import sts_jax as sts
 from sts_jax import dataset
+from sts_jax.dataset import shards
 
 SMALL = dataset.Collection(num_objects=4, num_per_object=2, num_full=1, objects_per_shard=2)
+
+
+def test_a_list_as_resolution_is_named():
+    collection = dataclasses.replace(SMALL)
+    object.__setattr__(collection, "resolution", [64, 64])  # users have no check of annotations
+    with pytest.raises(ValueError, match=r"resolution must be a tuple of two whole numbers .* got \[64, 64\]"):
+        collection.check()
+
+
+def test_the_only_frame_of_a_trajectory_is_stored_once():
+    collection = dataclasses.replace(SMALL, scenario=sts.physics.Perturbed(frames=1))
+    collection.check()
+    made = inspect.unwrap(shards._frames_of)(collection, np.arange(2), types.SimpleNamespace(pose=np.zeros((4, 1, 7))))
+    np.testing.assert_array_equal(made, [[i, 0] for i in range(4)])
+    assert shards.planned(collection, 0) == (4, 4 + 2 * collection.num_views)
 
 
 def test_the_split_of_published_collections_is_unchanged():
@@ -64,8 +82,11 @@ def test_classes_follow_the_categories():
         ({"num_objects": 0}, r"num_objects must be >= 1, got 0"),
         ({"num_objects": 10**10}, r"num_objects must be <= 1,000,000, got 10000000000"),
         ({"num_per_object": 10**30}, r"num_per_object must be <= 1,000,000, got 10+"),
-        ({"resolution": (10**5, 64)}, r"resolution must be two whole numbers .* 1 to 8,192 pixels, got \(100000, 64\)"),
-        ({"resolution": (64, 0)}, r"resolution must be two whole numbers .* got \(64, 0\)"),
+        (
+            {"resolution": (10**5, 64)},
+            r"resolution must be a tuple of two whole .* 1 to 8,192 pixels, got \(100000, 64\)",
+        ),
+        ({"resolution": (64, 0)}, r"resolution must be a tuple of two whole numbers .* got \(64, 0\)"),
         ({"categories": ()}, r"categories is empty, but it must name at least one class"),
         ({"categories": ("bottle", "cup")}, r"category is 'cup', but it must be one of bottle, camera"),
         ({"shares": (0.5, 0.5, 0.5)}, r"shares=\(0\.5, 0\.5, 0\.5\), but .* sum 1"),

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import inspect
 import io
 import json
 import multiprocessing
@@ -315,6 +316,18 @@ def test_a_condition_that_the_scenario_does_not_describe_is_kept_as_it_is(tmp_pa
     )
 
 
+def test_a_scenario_of_a_user_with_the_name_of_one_of_the_library_has_no_names_of_its_condition(tmp_path):
+    @dataclasses.dataclass(frozen=True)
+    class Perturbed(physics.Freefall):
+        wind: float = 1.0
+
+    collection = dataclasses.replace(native_dataset.COLLECTION, scenario=Perturbed(frames=FRAMES))
+    native_dataset.write(tmp_path / "native", collection=collection, condition=3)
+    export.to_lerobot(tmp_path / "native", tmp_path / "out")
+    features = json.loads((tmp_path / "out/meta/info.json").read_text())["features"]
+    assert [name for name in features if "condition" in name] == ["condition"]
+
+
 def test_a_dataset_behind_a_url_is_exported(native, tmp_path, monkeypatch):
     monkeypatch.setattr("sts_jax.dataset.remote.cache_folder", lambda: tmp_path / "cache")
     files = fsspec.filesystem("memory")
@@ -409,6 +422,8 @@ def test_faults_are_named_before_anything_is_written(tmp_path, monkeypatch):
     native_dataset.write(tmp_path / "native", full=0)
     with pytest.raises(ValueError, match=r"no trajectory with images of all frames: use frames='ends'"):
         export.to_png(tmp_path / "native", tmp_path / "out")
+    with pytest.raises(ValueError, match="frames must be 'all' or 'ends', got 'every'"):
+        inspect.unwrap(export._planned)(tmp_path / "native", "every", None)  # users have no check of annotations
     path = tmp_path / "native/shard-00002-of-00003.array_record"
     path.write_bytes(path.read_bytes()[:-1] + b"x")
     with pytest.raises(OSError, match=r"shard-00002-of-00003\.array_record is not the file"):

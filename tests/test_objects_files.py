@@ -339,6 +339,17 @@ def test_colours_of_a_ply_by_other_names_and_its_texture(tmp_path):
     assert is_red_above_blue(objects.load(tmp_path / "box.ply", strict=True))
 
 
+@pytest.mark.parametrize("kind", ["ushort", "int", "uint16"])
+def test_integer_colours_of_a_ply_that_are_no_bytes_are_refused(tmp_path, kind):
+    rows = ["{} {} {} 65535 32768 0".format(*p) for p in BOX.vertices] + ["3 {} {} {}".format(*f) for f in BOX.faces]
+    head = ["ply", "format ascii 1.0", "element vertex 8", *(f"property float {c}" for c in "xyz")]
+    head += [f"property {kind} {c}" for c in ("red", "green", "blue")]
+    end = ["element face 12", "property list uchar int vertex_indices", "end_header"]
+    (tmp_path / "box.ply").write_text("\n".join([*head, *end, *rows]))
+    with pytest.raises(ValueError, match=f"colours of the type {kind}: export colours of 8 bits"):
+        objects.load(tmp_path / "box.ply")
+
+
 def png16(path: Path, values: np.ndarray, kind: int) -> None:
     """Write 16-bit values, which Pillow writes only for grey images: grey 0, RGB 2, grey and alpha 4, RGBA 6."""
     height, width = values.shape[:2]

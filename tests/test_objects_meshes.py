@@ -1,5 +1,6 @@
 """Meshes of many formats as bodies: colours, textures, damage and decimation."""
 
+import json
 import sys
 import warnings
 from pathlib import Path
@@ -145,6 +146,40 @@ def test_gltf_factor_is_linear_and_scenes_are_merged(tmp_path):
     np.testing.assert_allclose(looked_up(body), np.where(high, [0, 64 / 255, 0], [128 / 255, 0, 0]), atol=1e-3)
     np.testing.assert_allclose(np.ptp(np.asarray(body.vertices), axis=0), [0.02, 0.02, 0.07], rtol=1e-5)
     np.testing.assert_allclose(volume(body), 2 * 0.02**3, rtol=1e-4)
+
+
+def test_a_dark_gltf_factor_is_not_rounded_to_8_bits(tmp_path):
+    factor, name = [0.002, 0.0031, 0.5004], tmp_path / "dark.gltf"
+    scene = trimesh.Scene(trimesh.creation.box((0.02, 0.02, 0.02)))
+    files = trimesh.exchange.gltf.export_gltf(scene, embed_buffers=True)
+    header = json.loads(files["model.gltf"])
+    header["materials"] = [{"pbrMetallicRoughness": {"baseColorFactor": [*factor, 1]}}]
+    primitive = header["meshes"][0]["primitives"][0]
+    primitive["attributes"].pop("COLOR_0", None)
+    primitive["material"] = 0
+    name.write_text(json.dumps(header))
+    np.testing.assert_allclose(looked_up(objects.load(name)), np.broadcast_to(factor, (12, 3, 3)), rtol=1e-5)
+
+
+def test_parts_that_overlap_are_reported_with_their_common_volume(tmp_path):
+    first, second = (trimesh.creation.box((0.03, 0.03, 0.03)) for _ in range(2))
+    for offset, warned in (([0.015, 0.002, 0.003], True), ([0.0299, 0, 0], False), ([0.03, 0, 0], False)):
+        both = trimesh.util.concatenate([first, second.copy().apply_translation(offset)])
+        both.export(tmp_path / "boxes.stl")
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            objects.load(tmp_path / "boxes.stl")
+        assert [str(one.message) for one in caught if "overlap" in str(one.message)] == (
+            [
+                f"{tmp_path / 'boxes.stl'}: parts of the mesh overlap, so that 11 of 54 ml of the contents count "
+                "twice: unite the parts, or give the mass"
+            ]
+            if warned
+            else []
+        )
+    inner = trimesh.creation.box((0.02, 0.02, 0.02))
+    trimesh.util.concatenate([first, inner, trimesh.creation.box((0.01, 0.01, 0.01))]).export(tmp_path / "nest.stl")
+    objects.load(tmp_path / "nest.stl")  # no warning: a solid within a cavity
 
 
 def test_several_textures_become_one(tmp_path):

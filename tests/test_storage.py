@@ -12,6 +12,7 @@ import threading
 from pathlib import Path
 
 import filelock
+import numpy as np
 import pytest
 
 from sts_jax import storage
@@ -81,8 +82,10 @@ def test_other_settings_are_refused_and_equal_ones_are_not(tmp_path):
     storage.claim(path, content)
     assert storage.read_json(path, "delete it") == {"seed": 0, "gel": {"sizes": [1, 2]}, "name": None}
     before = path.stat().st_mtime_ns
-    storage.claim(path, content)
+    storage.claim(path, content | {"seed": np.int64(0)})
     assert path.stat().st_mtime_ns == before
+    with pytest.raises(TypeError, match="a set cannot be written as JSON"):
+        storage.claim(path, {"seed": {0}})
     for change, message in (
         ({"seed": 1}, "json was made with seed = 0, but the current settings have seed = 1"),
         ({"gel": {"sizes": (1, 3)}}, r"sizes = \[1, 2\], but the current settings have gel\.sizes = \[1, 3\]"),

@@ -80,10 +80,11 @@ class Collection:
             raise ValueError("categories is empty, but it must name at least one class, such as 'bottle'")
         for category in self.categories if self.meshes is None else ():
             objects.find_family(category)
-        if len(self.resolution) != 2 or not all(type(n) is int and 1 <= n <= MOST_PIXELS for n in self.resolution):
+        whole = isinstance(self.resolution, tuple) and all(type(n) is int for n in self.resolution)
+        if not whole or len(self.resolution) != 2 or not all(1 <= n <= MOST_PIXELS for n in self.resolution):
             raise ValueError(
-                f"resolution must be two whole numbers (height, width) from 1 to {MOST_PIXELS:,} pixels, got "
-                f"{self.resolution!r}"
+                "resolution must be a tuple of two whole numbers (height, width) from 1 to "
+                f"{MOST_PIXELS:,} pixels, got {self.resolution!r}"
             )
         if self.rendered_per_object > self.num_per_object:
             raise ValueError(f"num_rendered must be <= num_per_object={self.num_per_object}, got {self.num_rendered}")

@@ -6,6 +6,7 @@ a few images and the trajectories of one shard are in memory at a time. [Dataset
 
 import concurrent.futures
 import csv
+import dataclasses
 import importlib.util
 import json
 import math
@@ -13,7 +14,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import cv2
 import numpy as np
@@ -195,6 +196,8 @@ def _exported(
 
 def _planned(folder: Path, frames: Frames, progress: Callable[[Progress], None] | None) -> _Job:
     """Verify the dataset, and list what is exported."""
+    if frames not in get_args(Frames):
+        raise ValueError(f"frames must be 'all' or 'ends', got {frames!r}")
     data = load(folder, shards=[0])
     folder = data.shards[0].parent  # a work directory has its dataset and the card in a folder below
     count = math.ceil(data.collection["num_objects"] / data.collection["objects_per_shard"])
@@ -270,9 +273,14 @@ def _words(data: Dataset, fields: dict[str, np.ndarray]) -> dict[str, np.ndarray
     known = {int(outcome): in_words(outcome) for outcome in physics.Outcome}
     words = {"class": np.array(label), "outcome_name": np.array(known.get(number, str(number)))}
     condition, start = fields.pop("condition"), 0
-    # The description of a dataset has the name of a scenario, but not the code of one that a user has written.
-    scenario = getattr(physics, data.collection["scenario"]["name"], None)
-    for quantity in scenario.quantities if scenario is not None else ():
+    # The description of a dataset has the name of a scenario, but not the code of one that a user has written, whose
+    # name may be that of another class.
+    stored = data.collection["scenario"]
+    library = (physics.Freefall, physics.Inclined, physics.Perturbed, physics.Released)
+    scenario = next((kind for kind in library if kind.__name__ == stored["name"]), None)
+    if scenario is None or not {*stored} <= {"name", *(field.name for field in dataclasses.fields(scenario))}:
+        return words | ({"condition": condition} if len(condition) else {})
+    for quantity in scenario.quantities:
         stop = start + 1 + quantity.vector
         words[f"condition.{quantity.name.replace(' ', '_')}"] = (
             condition[start:stop] if quantity.vector else condition[start]

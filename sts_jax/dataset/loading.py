@@ -372,6 +372,8 @@ def load(folder: str | Path, *, shards: Sequence[int] | None = None) -> Dataset:
     if manifest is None:
         raise FileNotFoundError(f"{folder} is not a collected dataset: give another folder, or call `collect`.")
     count = manifest.facts["shards"]
+    if shards is not None and not len(shards):
+        raise ValueError(f"shards is empty, but {folder} has the shards 0 to {count - 1}: name one or more")
     if any(not 0 <= index < count for index in shards or ()):
         raise ValueError(f"shards is {shards!r}, but {folder} has the shards 0 to {count - 1}")
     files = [records.shard_files(index, count) for index in (range(count) if shards is None else shards)]

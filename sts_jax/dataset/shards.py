@@ -91,7 +91,7 @@ def planned(collection: Collection, index: int) -> tuple[int, int]:
     ranks = collection.num_full - np.arange(collection.rendered_per_object) * collection.num_objects - first
     full = int(np.clip(ranks, 0, objects).sum())
     ends = objects * collection.rendered_per_object - full
-    return objects * collection.num_per_object, full * length + 2 * ends + objects * collection.num_views
+    return objects * collection.num_per_object, full * length + min(2, length) * ends + objects * collection.num_views
 
 
 def _members(collection: Collection, index: int) -> np.ndarray:
@@ -171,7 +171,7 @@ def _frames_of(collection: Collection, members: np.ndarray, trajectory: physics.
         if repeat >= collection.rendered_per_object:
             continue
         rank = repeat * collection.num_objects + members[place]
-        rows += [(i, t) for t in (range(last + 1) if rank < collection.num_full else (0, last))]
+        rows += [(i, t) for t in (range(last + 1) if rank < collection.num_full else sorted({0, last}))]
     return np.array(rows, np.int32)
 
 

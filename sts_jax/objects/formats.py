@@ -312,6 +312,8 @@ def _ply(data: bytes, files: Files) -> list[trimesh.Trimesh]:
     if re.search(rb"(?m)^format\s+ascii", head):
         body = re.sub(rb"\r\n?", b"\n", body)
     bare = re.sub(rb"(?m)^(comment|obj_info).*\n", b"", head)
+    if wide := re.search(rb"(?m)^property\s+(u?short|u?int(?:16|32)?)\s+(?:red|green|blue)\b", bare):
+        raise Refusal(f"the mesh has colours of the type {wide[1].decode()}: export colours of 8 bits (uchar)")
     pieces = _loaded(cut_ply(bare + end + body), "ply", files)
     names = [] if files.plain else re.findall(_TEXTURE, head)
     picture = files.image(names[0]) if names else None
@@ -402,6 +404,7 @@ def _gltf(data: bytes, files: Files) -> list[trimesh.Trimesh]:
         if not isinstance(material, PBRMaterial):
             continue
         number = int(material.name)
+        piece.metadata["factor"] = looks[number][0]  # which trimesh rounds to 8 bits
         material.baseColorTexture = images.get(number)
         if piece.visual.uv is not None:
             _, scale, angle, offset = _transform(looks[number][1])

@@ -97,7 +97,7 @@ def _piece_albedo(piece: trimesh.Trimesh, is_linear: bool) -> tuple[np.ndarray, 
     if isinstance(visual, trimesh.visual.TextureVisuals):
         material = visual.material
         if isinstance(material, trimesh.visual.material.PBRMaterial):
-            image, factor = material.baseColorTexture, material.baseColorFactor
+            image, factor = material.baseColorTexture, piece.metadata.get("factor", material.baseColorFactor)
         else:
             image, factor = getattr(material, "image", None), getattr(material, "diffuse", None)
         if visual.uv is None or len(visual.uv) != len(piece.vertices):

@@ -30,7 +30,7 @@ from sts_jax.objects.formats import read
 from sts_jax.objects.hulls import convex_hull
 from sts_jax.objects.materials import albedo
 from sts_jax.objects.parts import decompose
-from sts_jax.objects.surface import Surface, decimate, is_closed, merge, repaired
+from sts_jax.objects.surface import Surface, decimate, is_closed, merge, overlap, repaired
 
 # Up and front directions of a file for which only the up axis is given. Up becomes +z, and front becomes -y. The front
 # of a glTF file is +z (glTF specification).
@@ -39,6 +39,9 @@ AXES = {
     "y": ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
     "z": ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0)),
 }
+
+
+OVERLAP = 0.02  # share of the enclosed volume from which on parts that overlap are reported
 
 
 class ScaledDown(UserWarning):
@@ -240,10 +243,17 @@ def _body(
             interior = (points, _outward(points, ConvexHull(points)))
         else:
             interior = (vertices, _outward(vertices, hull))
-    elif holds and hull.volume > (1 + OPEN) * enclosed:
-        cavity = find_cavity(vertices, faces, enclosed)
-        if cavity is not None:
-            interior = (cavity.reshape(-1, 3), np.arange(3 * len(cavity)).reshape(-1, 3))
+    elif holds:
+        if (twice := overlap(vertices, faces)) > OVERLAP * enclosed:
+            warnings.warn(
+                f"{path}: parts of the mesh overlap, so that {twice * 1e6:.2g} of {enclosed * 1e6:.3g} ml of the "
+                "contents count twice: unite the parts, or give the mass",
+                stacklevel=3,
+            )
+        if hull.volume > (1 + OPEN) * enclosed:
+            cavity = find_cavity(vertices, faces, enclosed)
+            if cavity is not None:
+                interior = (cavity.reshape(-1, 3), np.arange(3 * len(cavity)).reshape(-1, 3))
     return assemble(
         vertices,
         faces,

@@ -10,6 +10,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+_PAIRS, _POINTS = 16, 48  # pairs of parts that are searched for an overlap, and points in the box of each
+
 
 class Surface(NamedTuple):
     """Triangles of a mesh, with a colour and texture coordinates at each corner of each triangle."""
@@ -139,6 +141,24 @@ def winding(point: np.ndarray, triangles: np.ndarray) -> float:
     dots = (np.einsum("fi,fi->f", left, right) for left, right in ((a, b), (b, c), (c, a)))
     along = one * two * three + sum(dot * size for dot, size in zip(dots, (three, one, two), strict=True))
     return float(np.arctan2(across, along).sum() / (2 * np.pi))
+
+
+def overlap(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Estimate the volume (m^3) that closed parts of a mesh have in common, from points in the boxes of pairs."""
+    part, _, closed = _parts(faces)
+    shells = [vertices[faces[part == index]].reshape(-1, 3) for index in np.flatnonzero(closed)]
+    boxes = []
+    for index, one in enumerate(shells):
+        for other in shells[index + 1 :]:
+            low, high = np.maximum(one.min(axis=0), other.min(axis=0)), np.minimum(one.max(axis=0), other.max(axis=0))
+            boxes += [(low, high)] if (low < high).all() else []
+    boxes.sort(key=lambda box: -np.prod(box[1] - box[0]))
+    random, twice, triangles = np.random.default_rng(0), 0.0, vertices[faces]
+    for low, high in boxes[:_PAIRS]:
+        points = random.uniform(low, high, (_POINTS, 3))
+        share = np.mean([winding(point, triangles) > 1.5 for point in points])
+        twice += float(share * np.prod(high - low))
+    return twice
 
 
 def surface_samples(
