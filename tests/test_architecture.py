@@ -13,11 +13,11 @@ ROOMS = [
     for name, paths, lines, budget in re.findall(r"^\| ([^|`]+) \| (`[^|]+) \| ([\d,]+) \| ([\d,]+) \|$", PAGE, re.M)
 ]
 TOTALS = {
-    "library without hardware": 26_400,
+    "library without hardware": 26_480,
     "hardware": 5_130,
     "experiments": 7_420,
     "benchmarks": 5_800,
-    "tests": 26_050,
+    "tests": 26_250,
 }
 
 

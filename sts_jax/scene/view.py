@@ -377,7 +377,7 @@ def _contacts(model: mujoco.MjModel, pad: int) -> _Contacts:
         bodies.append(np.full(slots, model.geom_bodyid[other]))
         # The normal points from the sensor's first geom to the second one.
         signs.append(np.full(slots, 1 if model.sensor_objid[sensor] == pad else -1, np.float32))
-    return _Contacts(*map(np.concatenate, (places, bodies, signs)))
+    return _Contacts(np.concatenate(places), np.concatenate(bodies), np.concatenate(signs))
 
 
 def _without_housing(sensor: Sensor) -> Sensor:
