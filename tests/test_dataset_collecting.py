@@ -55,6 +55,7 @@ def test_stored_frames_are_those_that_sense_draws(folder):
     np.testing.assert_array_equal(pairs.object, [2, 0])
 
 
+@pytest.mark.slow
 def test_trajectories_do_not_depend_on_the_number_of_rendered_ones(folder, sparse):
     whole, data = dataset.load(folder), dataset.load(sparse)
     for name in ("pose", "outcome", "wrench", "body"):

@@ -85,6 +85,7 @@ def test_a_firm_grasp_lifts_and_a_light_one_slips(gym_lift):
     assert rises[0.3, 0.5] == rises[1.0, 0.1] == 1
 
 
+@pytest.mark.slow
 def test_seeds_draw_the_ranges_of_the_task(gym_lift):
     frictions, places = [], []
     for seed in range(20):

@@ -141,6 +141,7 @@ def predictor():
     return untrained(CONFIG)
 
 
+@pytest.mark.slow
 def test_latents_are_the_predictors(predictor):
     made, _ = frames(70, 0)  # more than a chunk
     made.tactile[::2, 0] = np.round(255 * predictor.empty["tactile"])  # no contact

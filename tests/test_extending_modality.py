@@ -34,6 +34,7 @@ def data(tmp_path_factory):
     return dataset.load(folder)
 
 
+@pytest.mark.slow
 def test_pairs_have_the_measured_values(data):
     rows = np.array([4, 1])
     pairs = data.pairs(rows, measurements=(WRENCH,))

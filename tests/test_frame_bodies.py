@@ -227,6 +227,7 @@ def test_vmap_equals_a_loop_and_gradients_equal_finite_differences():
             assert float(gradients[k][body, 2]) == pytest.approx(numeric, rel=0.05, abs=2e-2)
 
 
+@pytest.mark.slow
 def test_traced_bodies_are_drawn_and_have_gradients():
     poses, wrenches = stacked(*PRESSED)
     frame, concrete = (
@@ -251,6 +252,7 @@ def test_an_invalid_pose_or_wrench_removes_only_its_body():
         assert np.isfinite(frame.tactile).all()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*pose puts")
 def test_a_body_below_the_gel_is_never_drawn():
     above, below = (BALL, at(0, 0, 0.04), NOTHING), (BALL, at(0, 0, -0.05), NOTHING)
@@ -259,6 +261,7 @@ def test_a_body_below_the_gel_is_never_drawn():
     np.testing.assert_allclose(frame.depth, many(above).depth, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_traced_sensor_draws_the_same_faces():
     tip = sts.Sensor.sized(0.02)
     wall = from_trimesh(trimesh.creation.box((0.004, 0.02, 0.03)))

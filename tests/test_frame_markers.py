@@ -30,6 +30,7 @@ def centre(share, x, y):
     return np.array([(weight * X).sum(), (weight * Y).sum()]) / weight.sum()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("force", [(0.0, 0.0), (0.25, -0.1)])
 def test_dots_move_with_the_skin_under_a_ball_and_nowhere_else_in_both_streams(force):
     plain, frame = (

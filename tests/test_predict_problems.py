@@ -52,6 +52,7 @@ def rounded(image):
     return (np.round(255 * np.asarray(image)) / 255).astype(np.float32)
 
 
+@pytest.mark.slow
 def test_valid_images_have_no_problem(images):
     frames, empty = images
     for name, frame in frames.items():

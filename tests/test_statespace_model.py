@@ -328,6 +328,7 @@ def concerned(loss, batch, part, name):
     return {term for term in before if before[term] != after[term]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "terms"),
     [
