@@ -190,6 +190,7 @@ def test_judgement(place, forces, qpos, reward, done):
         ({"mass": 0.0}, "task.mass is 0.0, but it must be > 0"),
         ({"yaw": -0.1}, "task.yaw is -0.1, but it must be >= 0"),
         ({"friction": (0.5, 0.2)}, r"task.friction is \(0.5, 0.2\)"),
+        ({"friction": (0.5,)}, r"task.friction is \(0.5,\), but it must be a tuple of two numbers"),
         ({"control_dt": 0.0015}, "task.control_dt is 0.0015 s, but it must be a multiple of timestep, 0.001 s"),
         ({"offset": 0.04}, "opening is 0.1 m, but the object reaches"),
         ({"height": 0.29}, r"task.height is 0.29 m, but the gripper rises by 0.278 m at most"),
@@ -223,6 +224,18 @@ def test_what_diverges_ends_the_episode(gym_lift, fault):
     assert (reward, terminated) == (0.0, True)
     gym_lift.reset(seed=0)
     assert not gym_lift.step(np.zeros(2, np.float32))[2]
+
+
+def test_an_action_may_be_a_list_and_its_shape_is_checked(gym_lift):
+    states = []
+    for action in ([0.5, 1.0], np.array([0.5, 1.0], np.float32)):
+        gym_lift.reset(seed=0)
+        gym_lift.step(action)
+        states.append(gym_lift.data.qpos.copy())
+    np.testing.assert_array_equal(*states)
+    for action in (np.zeros(3, np.float32), np.zeros((1, 2), np.float32)):
+        with pytest.raises(ValueError, match=r"action has the shape .*, but it must be \(2,\): \('lift', 'grip'\)"):
+            gym_lift.step(action)
 
 
 def test_an_unknown_render_mode_is_refused():

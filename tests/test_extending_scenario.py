@@ -89,6 +89,8 @@ def test_a_block_on_a_tilting_pad_slides_as_a_float64_loop_does(page, block, eng
 def test_outcomes_of_the_scenario_have_names_and_are_counted(page):
     scenario, rolled = page["Rolled"](), page["rolled"]
     assert [scenario.named(number) for number in (1, 100, 101)] == ["fell off", "stops early", "rolls on"]
+    with pytest.raises(ValueError, match=r"use scenario\.named\(10[01]\)"):
+        _ = rolled.outcomes
     np.testing.assert_array_equal(rolled.outcome, jax.vmap(scenario.outcome)(rolled.pose[:, 0], rolled.pose[:, -1]))
     assert physics.variant(scenario, "wide-friction") == dataclasses.replace(scenario, friction=(0.3, 0.9))
     with pytest.raises(ValueError, match="needs the fields fill, shell_scale, tilt in Rolled"):

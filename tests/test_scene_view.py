@@ -20,13 +20,16 @@ SENSOR = sts.Sensor(gel=sts.tactile.Gel(cells=(50, 50)))
 SMALL = dataclasses.replace(SENSOR, gel=dataclasses.replace(SENSOR.gel, size=(0.04, 0.04)))
 SIZE = (32, 32)
 
+STEP = '<option timestep="0.001"/>'
+
 
 def compiled(
     objects: str, sensor: sts.Sensor = SENSOR, finger: str = "", asset: str = "", option: str = ""
 ) -> mujoco.MjModel:
     """Objects above a pad on the world, and a finger without pad."""
     spec = mujoco.MjSpec.from_string(f"""
-    <mujoco><option gravity="0 0 0">{option}</option><asset>{asset}</asset><worldbody><site name="tip"/>{objects}
+    <mujoco><option gravity="0 0 0" timestep="0.001">{option}</option><asset>{asset}</asset><worldbody>
+    <site name="tip"/>{objects}
     <body name="finger" pos=".5 0 0">{finger}<site name="finger_tip"/></body></worldbody></mujoco>""")
     scene.attach(spec, "tip", sensor, name="pad")
     return spec.compile()
@@ -39,7 +42,7 @@ def forward(model: mujoco.MjModel) -> mujoco.MjData:
 
 
 OBJECTS = {  # position, rotation vector, geom, the same shape by trimesh
-    "ball": ((-0.03, -0.02, 0.0198), (0, 0, 0), 'type="sphere" size=".02"', trimesh.creation.icosphere(5, 0.02)),
+    "ball": ((-0.03, -0.02, 0.0199), (0, 0, 0), 'type="sphere" size=".02"', trimesh.creation.icosphere(5, 0.02)),
     "rod": (
         (0.03, -0.03, 0.04),
         (0.5, 0.3, 0.2),
@@ -265,7 +268,7 @@ BODY = geometry.body_of(mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{BAL
 
 def late() -> mujoco.MjModel:
     """A model with a body that was added after `attach`."""
-    spec = mujoco.MjSpec.from_string(f'<mujoco><worldbody><site name="tip"/>{BALL}</worldbody></mujoco>')
+    spec = mujoco.MjSpec.from_string(f'<mujoco>{STEP}<worldbody><site name="tip"/>{BALL}</worldbody></mujoco>')
     scene.attach(spec, "tip", SENSOR, name="pad")
     body = spec.worldbody.add_body(name="late")
     body.add_freejoint()
@@ -276,10 +279,33 @@ def late() -> mujoco.MjModel:
 def on_finger(sensor: sts.Sensor, half: float, z: float = -0.015) -> mujoco.MjModel:
     geom = f'<geom type="box" size="{half} .02 .01" pos="0 0 {z}"/>'
     spec = mujoco.MjSpec.from_string(
-        f'<mujoco><worldbody>{BALL}<body name="finger"><joint/>{geom}<site name="tip"/></body></worldbody></mujoco>'
+        f'<mujoco>{STEP}<worldbody>{BALL}<body name="finger"><joint/>{geom}<site name="tip"/></body></worldbody>'
+        "</mujoco>"
     )
     scene.attach(spec, "tip", sensor, name="pad")
     return spec.compile()
+
+
+def test_a_body_beside_its_pad_and_a_long_time_step_are_named():
+    geom = '<geom type="box" size=".02 .02 .01" pos="-.03 0 -.015"/>'
+    for option, message in (
+        ('timestep="0.001"', "the body 'finger' lies beside its pad 'pad', not behind it: turn the site"),
+        (
+            "",
+            "the time step is 2 ms, at which the forces on the pad 'pad' jitter: set option.timestep to at most 1.5 ms",
+        ),
+    ):
+        spec = mujoco.MjSpec.from_string(
+            f'<mujoco><option {option}/><worldbody>{BALL}<body name="finger"><joint/>'
+            f'{geom if option else ""}<site name="tip"/><inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/></body>'
+            "</worldbody></mujoco>"
+        )
+        scene.attach(spec, "tip", SMALL, name="pad")
+        with pytest.warns(UserWarning, match=message):
+            scene.View(spec.compile(), {"pad": SMALL})
+    soft = mujoco.MjSpec.from_string(f'<mujoco><worldbody>{BALL}<site name="tip"/></worldbody></mujoco>')
+    scene.attach(soft, "tip", SMALL, name="pad", press=scene.Press(force=1.0, area=4e-4, mass=0.1))
+    scene.View(soft.compile(), {"pad": SMALL})  # no warning
 
 
 def test_a_finger_that_collides_in_the_place_of_its_pad_is_named():
@@ -313,7 +339,7 @@ INVALID = {
     ),
     "a sensor larger than the finger": (
         lambda: (on_finger(SENSOR, 0.01), {}),
-        r"the pad 'pad' measures 150 x 150 mm, but the body 'finger' that carries it only 20 x 40 mm: .*sized\(0.02\)",
+        r"the pad 'pad' measures 150 x 150 mm, but the body 'finger' .* only 20 x 40 mm there: .*sized\(0.02\)",
     ),
     "a site that points into the finger": (
         lambda: (on_finger(SMALL, 0.02, 0.011), {"sensors": {"pad": SMALL}}),

@@ -1,5 +1,7 @@
 """The gel's equilibrium against a float64 solver, closed forms and its own balance."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -189,3 +191,33 @@ def test_indentation_by_the_pose_alone_has_its_depth_up_to_the_limit():
     for sink in (0, 0.01):
         got = tactile.indent(GEL, jnp.asarray(height - sink, jnp.float32))
         np.testing.assert_allclose(got.pressure, 2e6 * np.clip(sink - height, 0, 0.005), atol=5)
+
+
+def of_side(side):
+    """A gel that is scaled in all lengths, at the same pressures, and a function of the place of a force on a ball.
+
+    Places are those on the gel of 0.15 m. The function returns the rotation vector and whether it is balanced.
+    """
+    scale = side / 0.15
+    gel = dataclasses.replace(
+        GEL, size=(side, side), max_depth=GEL.max_depth * scale, stiffness=GEL.stiffness / scale**3
+    )
+    height = jnp.asarray(ball(*grid(gel), 0.02 * scale, (0.01 * scale, -0.02 * scale)), jnp.float32)
+
+    def motion(place):
+        found = settle(gel, height, push(0.05, place[0] * scale, place[1] * scale))
+        return found.turn, found.balanced
+
+    return motion
+
+
+@pytest.mark.parametrize("side", [0.015, 0.005, 1.0])
+def test_a_scaled_gel_has_the_same_rotations_derivatives_and_balances(side):
+    plain, scaled = of_side(0.15), of_side(side)
+    for place, balanced in (((0.0102, -0.0199), True), ((0.06, 0.0), False)):
+        (one, first), (two, second) = plain(place), scaled(place)
+        np.testing.assert_allclose(two, one, rtol=0.01, atol=1e-5)
+        assert first == second == balanced
+    middle = jnp.array([0.0102, -0.0199])
+    expected, jacobian = (jax.jacfwd(lambda at, motion=motion: motion(at)[0])(middle) for motion in (plain, scaled))
+    np.testing.assert_allclose(jacobian, expected, rtol=0.01, atol=0.01 * jnp.abs(expected).max())

@@ -137,6 +137,15 @@ class Dataset:
     view_shard_of: np.ndarray  # int (k,): index of the shard of each view
     view_record_of: np.ndarray  # int (k,): index of the record of each view in its shard
 
+    def __repr__(self) -> str:
+        height, width = self.collection["resolution"]
+        parts = ", ".join(f"{len(objects)} {part}" for part, objects in self.split.items())
+        return (
+            f"Dataset({self.collection['scenario']['name']}, {len(self.trajectory['outcome'])} trajectories of "
+            f"{self.collection['num_objects']} objects ({parts}), {len(self.frames)} frames and "
+            f"{len(self.view_shard_of)} views of {height} x {width} pixels)"
+        )
+
     def images(self, rows: np.ndarray, *, opened: dict[int, records.Shard] | None = None) -> records.Images:
         """Read the images of stored frames.
 

@@ -1,10 +1,10 @@
 """`GymLift`: the task as an environment of Gymnasium, in C MuJoCo. The import registers it as `sts_jax/Lift-v0`."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
 
 from sts_jax.environments.playground import picture, to_uint8
 from sts_jax.environments.task import (
@@ -81,8 +81,11 @@ class GymLift(gymnasium.Env[Observation, np.ndarray]):
         mujoco.mj_forward(self.model, self.data)
         return self._observe(), self._judge()[2]
 
-    def step(self, action: Float[np.ndarray, "2"]) -> tuple[Observation, float, bool, bool, dict]:
+    def step(self, action: np.ndarray | Sequence[float]) -> tuple[Observation, float, bool, bool, dict]:
         """Move the targets of the servos, and advance the physics by `task.control_dt`."""
+        if np.shape(action) != (len(ACTIONS),):
+            raise ValueError(f"action has the shape {np.shape(action)}, but it must be ({len(ACTIONS)},): {ACTIONS}")
+        action = np.asarray(action, np.float32)
         self.data.ctrl[:] = target(self.setting, self.task, self.data.ctrl, action)
         with quiet():
             mujoco.mj_step(self.model, self.data, self.task.substeps)

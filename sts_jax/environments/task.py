@@ -66,6 +66,10 @@ class Task:
         for name in ("offset", "yaw"):
             if not 0 <= (value := getattr(self, name)) < np.inf:
                 raise ValueError(f"task.{name} is {value}, but it must be >= 0 and finite")
+        for name in ("resolution", "friction", "speed"):
+            value = getattr(self, name)
+            if not isinstance(value, tuple) or len(value) != 2:
+                raise ValueError(f"task.{name} is {value!r}, but it must be a tuple of two numbers")
         if not 0 < self.friction[0] <= self.friction[1] < np.inf:
             raise ValueError(f"task.friction is {self.friction}, but it must be a range (low, high) of values > 0")
         if abs(self.substeps * self.timestep - self.control_dt) > 1e-6 * self.control_dt:

@@ -69,7 +69,10 @@ class Trajectory(NamedTuple):
     @property
     def outcomes(self) -> tuple[Outcome, ...]:
         """The outcome of each trajectory. For a scenario with outcomes of its own, use `Scenario.named`."""
-        return tuple(Outcome(int(number)) for number in np.ravel(self.outcome))
+        numbers = np.ravel(self.outcome).tolist()
+        if own := sorted({*numbers} - {*map(int, Outcome)}):
+            raise ValueError(f"outcome has the number {own[0]} of a scenario of your own: use scenario.named({own[0]})")
+        return tuple(map(Outcome, numbers))
 
     def __repr__(self) -> str:
         shown = (self.time, self.outcome, self.settled, self.body)

@@ -92,6 +92,7 @@ class View:
         pads = {name: _pad_geom(model, name, sensor) for name, sensor in sensors.items()}
         for name in pads:
             _check_finger(model, name, pads)
+            _check_timestep(model, name, pads[name])
         seen = _seen(model, pads, bodies, groups, hide)
         drawn = sorted(set().union(*seen.values()))
         self._shapes = {
@@ -305,8 +306,8 @@ def _check_finger(model: mujoco.MjModel, name: str, pads: Mapping[str, int]) -> 
     if (size > _OVERHANG * finger).any():
         raise ValueError(
             f"the pad {name!r} measures {_millimetres(size)}, but the body {_body_name(model, carrier)!r} that carries "
-            f"it only {_millimetres(finger)}: use a smaller sensor, such as Sensor.sized({finger.min():.3g}), or put "
-            "the site on a body without other geoms"
+            f"it only {_millimetres(finger)} there: turn the site, whose z axis must point out of the finger, use a "
+            f"smaller sensor, such as Sensor.sized({finger.min():.3g}), or put the site on a body without other geoms"
         )
     thickness = 2 * model.geom_size[pad][2]
     over = [part for part in corners if (part.min(axis=0)[:2] < 0).all() and (part.max(axis=0)[:2] > 0).all()]
@@ -317,6 +318,12 @@ def _check_finger(model: mujoco.MjModel, name: str, pads: Mapping[str, int]) -> 
             f"{_millimetres([depth.max()])} in front of the gel and not behind it: turn the site, whose z axis must "
             "point out of the finger"
         )
+    low, high = (edge(np.concatenate(corners), axis=0) for edge in (np.min, np.max))
+    if not ((low[:2] < 0).all() and (high[:2] > 0).all()):
+        warn(
+            f"the body {_body_name(model, carrier)!r} lies beside its pad {name!r}, not behind it: turn the site, "
+            "whose z axis must point out of the finger"
+        )
     for geom, part in zip(geoms, corners, strict=True):
         covers = (part.min(axis=0)[:2] < 0).all() and (part.max(axis=0)[:2] > 0).all()
         touches = (model.geom_contype[geom] | model.geom_conaffinity[geom]) and part[:, 2].max() > -_BEHIND
@@ -326,6 +333,16 @@ def _check_finger(model: mujoco.MjModel, name: str, pads: Mapping[str, int]) -> 
                 f"pad {name!r} and collides, too, so the pad feels only a part of the force: move the site out of the "
                 "finger by the gel's thickness, or set the geom's contype and conaffinity to 0"
             )
+
+
+def _check_timestep(model: mujoco.MjModel, name: str, pad: int) -> None:
+    """Warn of time steps at which MuJoCo makes a pad softer (`refsafe`), and its forces jitter."""
+    constant = model.geom_solref[pad, 0]  # s, negative for a `Press`
+    if 0 < constant < 2 * (1 - 1e-6) * model.opt.timestep:
+        warn(
+            f"the time step is {1e3 * model.opt.timestep:g} ms, at which the forces on the pad {name!r} jitter: set "
+            f"option.timestep to at most {1e3 * constant / 2:g} ms"
+        )
 
 
 def _corners(model: mujoco.MjModel, geom: int) -> Float[np.ndarray, "n 3"]:

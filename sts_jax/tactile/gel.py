@@ -15,10 +15,11 @@ from sts_jax import _cpu_reductions
 from sts_jax._ranges import LENGTH, POSITIVE, STATIC
 
 _NEWTON_STEPS = 20  # largest number of steps
-_SETTLED = 1e-7  # m, the iteration ends after a step shorter than this
+_SETTLED = 1e-7  # m, the iteration ends after a step shorter than this, on a pad of `_SIDE`
 _ENOUGH = 0.5  # a full step is accepted if it reduces the energy's directional derivative to this share
 _STEP_LENGTHS = (1.0, 0.6, 0.35, 0.15, 0.05)  # candidates of the line search, relative to a full step
-_LEVER = 0.02  # m, a tilt is expressed as the height that it causes at this distance
+_LEVER = 0.02  # m, a tilt is expressed as the height that it causes at this distance, on a pad of `_SIDE`
+_SIDE = 0.15  # m, mean of the pad's width and height to which lengths of the computation are in proportion
 _BOTTOM = 300.0  # stiffness of the hard bottom beyond `max_depth`, relative to the springs
 _FAR = 1.0  # m, height that replaces inf where there is no object
 
@@ -42,8 +43,8 @@ class Gel:
     # Largest tilt of an object from its given pose, about x and about y (rad). The default is 5 degrees, our choice. It
     # must be < 0.3, because the equilibrium assumes that the tangent of a tilt is equal to its angle.
     max_tilt: Scalar = dataclasses.field(default=0.0873, metadata=POSITIVE | {"below": 0.3})
-    # Largest relative error of a balance: error of Fz divided by Fz, and error of Mx or My divided by Fz times 1 cm.
-    # Our choice.
+    # Largest relative error of a balance: error of Fz divided by Fz, and error of Mx or My divided by Fz times 1/15 of
+    # the mean of the pad's width and height (1 cm). Our choice.
     tolerance: Scalar = dataclasses.field(default=0.005, metadata=POSITIVE)
     # Number of rows and columns of the grid. The default gives cells of 1 mm.
     cells: tuple[int, int] = dataclasses.field(default=(150, 150), metadata=POSITIVE | {"at_most": 4096} | STATIC)
@@ -127,23 +128,25 @@ def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) ->
     pressed = force > 0
     safe_force = jnp.where(pressed, force, 1)
     load = jnp.where(pressed, force, 0) / (gel.stiffness * cell_area(gel))  # sum of the springs' compressions (m)
-    # Tilts are about the centre of pressure. Their unit is the height (m) at the distance `_LEVER` from this centre.
+    # Tilts are about the centre of pressure. Their unit is the height (m) at the distance `lever` from this centre.
+    scale = (gel.size[0] + gel.size[1]) / 2 / _SIDE
+    lever = _LEVER * scale
     half_x, half_y = gel.size[0] / 2, gel.size[1] / 2
     wanted_x, wanted_y = -wrench[4] / safe_force, wrench[3] / safe_force
     on_pad = (jnp.abs(wanted_x) <= half_x) & (jnp.abs(wanted_y) <= half_y)
     centre_x, centre_y = jnp.clip(wanted_x, -half_x, half_x), jnp.clip(wanted_y, -half_y, half_y)
     x, y = cell_centres(gel)
-    x, y = (x[0] - centre_x) / _LEVER, (y[:, 0] - centre_y) / _LEVER
+    x, y = (x[0] - centre_x) / lever, (y[:, 0] - centre_y) / lever
     target = load * jnp.array([1.0, 0.0, 0.0])
 
     height = jnp.where(jnp.isfinite(heights), heights, _FAR)
-    tilt = jnp.tan(gel.max_tilt) * _LEVER
+    tilt = jnp.tan(gel.max_tilt) * lever
     bound = jnp.stack([jnp.float32(jnp.inf), tilt, tilt])
 
     touch = _cpu_reductions.minimum(jnp.min(height, axis=0))
     reach = touch <= gel.max_depth
     start = jnp.stack([touch + gel.max_depth, jnp.float32(0), jnp.float32(0)])
-    u = _newton(height, x, y, target, start, bound, gel.max_depth)
+    u = _newton(height, x, y, target, start, bound, gel.max_depth, _SETTLED * scale)
 
     u = jnp.where(pressed & reach, u, 0)
     length = _plane(u, x, y) - height
@@ -152,12 +155,12 @@ def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) ->
     beyond = jnp.where(pressed & reach, jnp.maximum(deepest - gel.max_depth, 0), 0)
     length = jnp.where(pressed & reach, jnp.clip(length - beyond, 0, gel.max_depth), 0)
 
-    # A moment is compared as the force that causes it at a lever of 1 cm.
-    residual = jnp.abs(_moments(length, x, y) - target) * jnp.array([1.0, _LEVER / 0.01, _LEVER / 0.01])
+    # A moment is compared as the force that causes it at half of the lever.
+    residual = jnp.abs(_moments(length, x, y) - target) * jnp.array([1.0, 2.0, 2.0])
     balanced = ~pressed | (reach & on_pad & jnp.all(residual <= gel.tolerance * load))
     return Equilibrium(
-        sink=u[0] - beyond - (u[1] * centre_y + u[2] * centre_x) / _LEVER,
-        turn=jnp.stack([-u[1], u[2]]) / _LEVER,
+        sink=u[0] - beyond - (u[1] * centre_y + u[2] * centre_x) / lever,
+        turn=jnp.stack([-u[1], u[2]]) / lever,
         pressure=gel.stiffness * length,
         balanced=balanced,
     )
@@ -181,13 +184,15 @@ def _newton(
     start: Float[Array, "3"],
     bound: Float[Array, "3"],
     limit: Scalar,
+    settled: Scalar,
 ) -> Float[Array, "3"]:
     """Find the plane `u0 + u1 y + u2 x` by which an object must move down so that the springs carry the load.
 
     `height` (m) is finite. x and y of the columns and rows are relative to the centre of pressure and divided by
-    `_LEVER`. `target` has the wanted sums of the springs' compressions, and of the compressions times y and x (m).
+    the lever. `target` has the wanted sums of the springs' compressions, and of the compressions times y and x (m).
     `start` is the first u, `bound` the largest absolute values of u (m). If they exclude the target, the sums are near
-    it. `limit` is the compression at which a spring meets the hard bottom (m).
+    it. `limit` is the compression at which a spring meets the hard bottom (m). The iteration ends after a step
+    shorter than `settled` (m).
     """
     near_bound = 0.9999 * bound
 
@@ -223,7 +228,7 @@ def _newton(
         return _Descent(state.steps + 1, u, jnp.max(jnp.abs(step)), gradient, hessian)
 
     def unsettled(state: _Descent) -> Bool[Array, ""]:
-        return (state.steps < _NEWTON_STEPS) & (state.step > _SETTLED)
+        return (state.steps < _NEWTON_STEPS) & (state.step > settled)
 
     fixed = jax.lax.stop_gradient((height, x, y, target))
     first = jax.lax.stop_gradient(start)
