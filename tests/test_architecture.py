@@ -13,7 +13,7 @@ ROOMS = [
     for name, paths, lines, budget in re.findall(r"^\| ([^|`]+) \| (`[^|]+) \| ([\d,]+) \| ([\d,]+) \|$", PAGE, re.M)
 ]
 TOTALS = {
-    "library without hardware": 26_480,
+    "library without hardware": 26_530,
     "hardware": 5_130,
     "experiments": 7_420,
     "benchmarks": 5_800,
