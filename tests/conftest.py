@@ -1,15 +1,17 @@
 """Set-up of the tests: run-time checks of shapes and types, and faster compilation.
 
-Most of the suite's time is compilation. Three settings shorten it:
+Most of the suite's time is compilation. Four settings shorten it:
 
 - All worker processes share one cache of compiled programs, including small ones. If JAX_COMPILATION_CACHE_DIR is set,
   the cache is kept there.
 - XLA optimises less, which shortens compilation by a third. The small arrays of the tests do not need more. A variable
   XLA_FLAGS in the environment takes precedence, even if it is empty. The notebooks are tested with XLA's defaults.
+- Python collects garbage less often, because each search visits the millions of objects that JAX keeps.
 - Compiled programs stay in memory from one test file to the next, as long as there is room for them.
 """
 
 import atexit
+import gc
 import importlib.metadata
 import os
 import shutil
@@ -37,6 +39,7 @@ import jax
 import jaxtyping
 import pytest
 
+gc.set_threshold(200_000, 20, 100)
 jaxtyping.install_import_hook("sts_jax", "checker.check")
 
 MOST_MAPS = 30_000  # memory maps of a process. Linux allows 65,530, and XLA crashes beyond that

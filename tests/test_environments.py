@@ -190,7 +190,6 @@ def test_judgement(place, forces, qpos, reward, done):
         ({"mass": 0.0}, "task.mass is 0.0, but it must be > 0"),
         ({"yaw": -0.1}, "task.yaw is -0.1, but it must be >= 0"),
         ({"friction": (0.5, 0.2)}, r"task.friction is \(0.5, 0.2\)"),
-        ({"friction": (0.5,)}, r"task.friction is \(0.5,\), but it must be a tuple of two numbers"),
         ({"control_dt": 0.0015}, "task.control_dt is 0.0015 s, but it must be a multiple of timestep, 0.001 s"),
         ({"offset": 0.04}, "opening is 0.1 m, but the object reaches"),
         ({"height": 0.29}, r"task.height is 0.29 m, but the gripper rises by 0.278 m at most"),
@@ -199,6 +198,14 @@ def test_judgement(place, forces, qpos, reward, done):
 def test_bad_tasks_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         Lift(sensor(), task=dataclasses.replace(TASK, **changes))
+
+
+@pytest.mark.parametrize(("name", "value"), [("friction", [0.3, 0.5]), ("resolution", (16,)), ("speed", [0.2, 0.1])])
+def test_a_list_or_a_tuple_of_another_length_in_a_task_is_named(name, value):
+    task = dataclasses.replace(TASK)
+    object.__setattr__(task, name, value)  # users have no check of annotations
+    with pytest.raises(ValueError, match=rf"task.{name} is .* but it must be a tuple of two numbers"):
+        task.check()
 
 
 @pytest.mark.parametrize(
