@@ -333,7 +333,7 @@ class OpenCVCamera:
             counted = 0 if limit_s is None else repeats
             frame = previous = Captured(image, time_s, sequence, self._epoch, dropped, counted, delayed)
             late = counted and limit_s is not None and time_s - same_since > limit_s
-            if late and not frame.black and image.min() < 255:  # a view that is wholly too dark or too bright is equal
+            if late and not frame.black and image.min() < 255:  # wholly black or white frames are equal
                 remedy = "replug it or restart its server, or set frozen_after_s=None if it may repeat images"
                 self._fail(FrozenCameraError(f"{config.name} has sent the same image for {limit_s:g} s: {remedy}."))
                 continue
