@@ -10,7 +10,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-_PAIRS, _POINTS = 16, 48  # pairs of parts that are searched for an overlap, and points in the box of each
+_LARGEST, _PAIRS, _POINTS = 100, 16, 48  # of an overlap: parts, pairs of parts, and points in the box of each pair
 
 
 class Surface(NamedTuple):
@@ -144,20 +144,19 @@ def winding(point: np.ndarray, triangles: np.ndarray) -> float:
 
 
 def overlap(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Estimate the volume (m^3) that closed parts of a mesh have in common, from points in the boxes of pairs."""
+    """Estimate the volume (m^3) that the largest closed parts of a mesh have in common, from random points."""
     part, _, closed = _parts(faces)
-    shells = [vertices[faces[part == index]].reshape(-1, 3) for index in np.flatnonzero(closed)]
-    boxes = []
-    for index, one in enumerate(shells):
-        for other in shells[index + 1 :]:
-            low, high = np.maximum(one.min(axis=0), other.min(axis=0)), np.minimum(one.max(axis=0), other.max(axis=0))
-            boxes += [(low, high)] if (low < high).all() else []
-    boxes.sort(key=lambda box: -np.prod(box[1] - box[0]))
+    least, most = np.full((len(closed), 3), np.inf), np.full((len(closed), 3), -np.inf)
+    np.minimum.at(least, part, vertices[faces].min(axis=1))
+    np.maximum.at(most, part, vertices[faces].max(axis=1))
+    largest = np.argsort(np.where(closed, -np.prod(most - least, axis=1), 0))[:_LARGEST]
+    one, other = (largest[index] for index in np.triu_indices(len(largest), 1))
+    low, high = np.maximum(least[one], least[other]), np.minimum(most[one], most[other])
+    sizes = np.where((low < high).all(axis=1) & closed[one] & closed[other], np.prod(high - low, axis=1), 0)
     random, twice, triangles = np.random.default_rng(0), 0.0, vertices[faces]
-    for low, high in boxes[:_PAIRS]:
-        points = random.uniform(low, high, (_POINTS, 3))
-        share = np.mean([winding(point, triangles) > 1.5 for point in points])
-        twice += float(share * np.prod(high - low))
+    for pair in (pair for pair in np.argsort(-sizes)[:_PAIRS] if sizes[pair] > 0):
+        points = random.uniform(low[pair], high[pair], (_POINTS, 3))
+        twice += float(np.mean([winding(point, triangles) > 1.5 for point in points]) * sizes[pair])
     return twice
 
 
