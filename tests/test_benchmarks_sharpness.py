@@ -67,7 +67,7 @@ def test_parts_of_both_splits_are_disjoint_and_equally_large(monkeypatch):
     assert sorted(np.concatenate(parts)) == list(range(100))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:visual shows no object")  # the control has the last image as input
 def test_a_tiny_run_prints_a_table_and_resumes(tmp_path, capsys):
     args = sharpness.Args(("default", "last"), tmp_path, steps=2, trajectories=48, longer=("default",), repeated=())

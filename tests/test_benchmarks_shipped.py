@@ -38,7 +38,7 @@ def test_worse_images_have_the_noise_and_the_blur_of_the_options():
     assert np.array_equal(shipped.degraded(grey, shipped.Args("freefall"), np.random.default_rng(0)), grey)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_small_run_prints_the_metrics_of_every_input(tmp_path):
     args = shipped.Args("released", objects=10, workdir=tmp_path / "work")
     text = shipped.main(args)

@@ -108,8 +108,9 @@ def test_a_full_disk_is_named_and_nothing_is_lost(folder, small_disk):
     assert not list((small_disk / "falls").glob(".*partial"))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("processes", [1, 2])
+@pytest.mark.parametrize(
+    "processes", [pytest.param(1, marks=pytest.mark.long), pytest.param(2, marks=pytest.mark.slow)]
+)
 def test_random_kills_of_the_command_leave_the_same_bytes_and_nothing_else(tmp_path: Path, processes):
     result = kills.drill(kills.Args(kills=5, processes=processes), tmp_path)
     assert result.kills >= 5

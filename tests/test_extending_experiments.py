@@ -44,7 +44,7 @@ def test_the_code_of_the_page_runs(title, tmp_path, monkeypatch, capsys):
     assert "height error (mm)" in capsys.readouterr().out or title != "Another metric"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_another_image_size_goes_through_every_stage(tmp_path):
     run.main(tiny(freefall.SMOKE, physics.Freefall(frames=15), (96, 96), image_size=48), tmp_path)
     predictors = summary(tmp_path)
@@ -85,7 +85,7 @@ def test_the_code_of_the_page_runs_an_experiment_with_its_own_parts(tmp_path, ca
         run.main(config, tmp_path, only="train")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_experiment_trains_and_scores_a_further_modality(tmp_path):
     def forces(data, trajectories):
         return data.trajectory["wrench"][trajectories][:, [0, -1], :3]
