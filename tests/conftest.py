@@ -4,8 +4,10 @@ Most of the suite's time is compilation. Four settings shorten it:
 
 - All worker processes share one cache of compiled programs, including small ones. If JAX_COMPILATION_CACHE_DIR is set,
   the cache is kept there.
-- XLA does not optimise, which halves compilation. The small arrays of the tests do not need more. A variable
-  XLA_FLAGS in the environment takes precedence, even if it is empty. The notebooks are tested with XLA's defaults.
+- XLA does not optimise, which halves compilation. The small arrays of the tests do not need more. Without its fusion
+  emitters and optimisation, XLA's concurrent schedule gives wrong images (seen with jaxlib 0.10.2), so it is off. A
+  variable XLA_FLAGS in the environment takes precedence, even if it is empty. The notebooks are tested with XLA's
+  defaults.
 - Python collects garbage less often, because each search visits the millions of objects that JAX keeps.
 - Compiled programs stay in memory from one test file to the next, as long as there is room for them.
 """
@@ -32,7 +34,7 @@ if importlib.metadata.version("jaxlib").startswith("0.10.") and "STS_JAX_EXACT" 
     os.environ.setdefault(
         "XLA_FLAGS",
         "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true "
-        "--xla_cpu_use_fusion_emitters=false",
+        "--xla_cpu_use_fusion_emitters=false --xla_cpu_enable_concurrency_optimized_scheduler=false",
     )
 
 import jax
