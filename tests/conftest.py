@@ -5,7 +5,7 @@ Most of the suite's time is compilation. Four settings shorten it:
 - All worker processes share one cache of compiled programs, including small ones. If JAX_COMPILATION_CACHE_DIR is set,
   the cache is kept there.
 - XLA does not optimise, which halves compilation. The small arrays of the tests do not need more. Without its fusion
-  emitters and optimisation, XLA's concurrent schedule gives wrong images (seen with jaxlib 0.10.2), so it is off. A
+  emitters and optimisation, XLA's concurrent schedule gives wrong images (seen with jaxlib 0.10.1), so it is off. A
   variable XLA_FLAGS in the environment takes precedence, even if it is empty. The notebooks are tested with XLA's
   defaults.
 - Python collects garbage less often, because each search visits the millions of objects that JAX keeps.
