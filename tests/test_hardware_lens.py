@@ -66,7 +66,7 @@ def test_directions_invert_the_projection_over_the_whole_image(lens):
     pixels = np.stack([columns, rows], axis=-1)
     rays = lens_module.directions(lens, pixels)
     np.testing.assert_allclose(np.linalg.norm(rays, axis=-1), 1, atol=1e-12)
-    np.testing.assert_allclose(lens_module.project_camera(lens, rays), pixels, atol=1e-6)
+    np.testing.assert_allclose(lens_module.project_camera(lens, rays), pixels, atol=1e-4)
 
 
 def test_a_polynomial_that_bends_back_is_used_up_to_its_largest_value():

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from sts_jax import storage
 from sts_jax._checked import checked
-from sts_jax.hardware.lens import Lens, distort_angle, rectification, window
-from sts_jax.optics import Camera
+from sts_jax.hardware.lens import Lens, distort_angle, rectification
+from sts_jax.optics import Camera, full_window
 
 FEWEST_IMAGES = 6  # least number of usable images
 FEWEST_CORNERS = 12  # least number of corners in a usable image
@@ -322,7 +322,7 @@ def _pose_on_pad(pose: np.ndarray, index: int) -> tuple[tuple[float, float, floa
 
 def view_angle(lens: Lens, pinhole: Camera) -> float:
     """Largest angle from the optical axis of the real camera to a corner of the sensor's view (rad)."""
-    left, top, width, height = window(pinhole, _RESOLUTION)
+    left, top, width, height = np.asarray(full_window(pinhole, _RESOLUTION), np.float64)
     corners = np.array([(x, y, 0.0) for x in (left, left + width) for y in (top, top + height)])
     seen = corners @ lens.matrix.T + np.asarray(lens.translation)
     return float(np.arctan2(np.hypot(seen[:, 0], seen[:, 1]), seen[:, 2]).max())

@@ -17,13 +17,13 @@ from jaxtyping import Float, UInt, UInt8
 from scipy.spatial.transform import Rotation
 
 from sts_jax._checked import checked
-from sts_jax.optics import Camera
+from sts_jax.optics import Camera, full_window
 
 _MARGIN = 16  # distance beyond the image's border at which coordinates are clipped (pixels)
 _BAND = 256  # number of rows of a map that are computed at once, which limits the memory
 _GRAZING = 1e-6  # smallest cosine of the angle between a ray and the pad's normal for which they intersect
 _PROBES = 64  # least number of points along the longer side at which the density of a map is measured
-_TABLE = 2048  # number of angles in the table that gives the inversion its start values
+_TABLE = 8192  # number of angles in the table that inverts the model of the lens
 
 Maps = tuple[np.ndarray, np.ndarray]  # fixed-point maps for `cv2.remap`
 Raw = UInt8[np.ndarray, "rows columns *channels"]
@@ -125,7 +125,7 @@ def directions(lens: Lens, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarra
 @checked
 def rectification(lens: Lens, pinhole: Camera, resolution: tuple[int, int]) -> Float[np.ndarray, "height width 2"]:
     """Raw pixel of each rectified pixel, as float32. Some lie outside of the raw image if the view exceeds it."""
-    left, top, width, height = window(pinhole, resolution)
+    left, top, width, height = np.asarray(full_window(pinhole, resolution), np.float64)
     rows, columns = resolution
     x = left + (np.arange(columns) + 0.5) / columns * width
     y = top + (np.arange(rows) + 0.5) / rows * height
@@ -163,7 +163,7 @@ def distortion(
     The pixels lie outside of the rectified image for rays outside of the view. They are NaN for rays that do not meet
     the plane of the gel's outer face, or that are beyond `Lens.largest_angle`.
     """
-    left, top, width, height = window(pinhole, resolution)
+    left, top, width, height = np.asarray(full_window(pinhole, resolution), np.float64)
     scale = np.array([resolution[1] / width, resolution[0] / height])
     x = (np.arange(lens.width * samples) + 0.5) / samples - 0.5
     y = (np.arange(lens.height * samples) + 0.5) / samples - 0.5
@@ -201,18 +201,6 @@ def _over_grid(x: np.ndarray, y: np.ndarray, values: Callable[[np.ndarray], np.n
     """The values of a function of points (rows, columns, 2) on a grid, band by band, as float32."""
     bands = (np.stack(np.meshgrid(x, y[first : first + _BAND]), axis=-1) for first in range(0, len(y), _BAND))
     return np.concatenate([values(points).astype(np.float32) for points in bands])
-
-
-def window(pinhole: Camera, resolution: tuple[int, int]) -> tuple[float, float, float, float]:
-    """`optics.full_window` in float64: left, top, width and height of the view on the gel's outer face (m).
-
-    JAX would round to float32, which moves raw pixels of a large image by up to 1e-4.
-    """
-    rows, columns = resolution
-    height = 2 * float(pinhole.distance) * math.tan(float(pinhole.fov) / 2)
-    width = min(height * float(pinhole.aspect), height * columns / rows)
-    height = width * rows / columns
-    return -width / 2, -height / 2, width, height
 
 
 def _plain(pinhole: Camera) -> Camera:
@@ -271,17 +259,9 @@ def distort_angle(k: Sequence[float], angle: Float[np.ndarray, "*n"]) -> Float[n
 
 
 def _undistort_angle(lens: Lens, distorted_angle: np.ndarray) -> np.ndarray:
-    """Invert `distort_angle` by Newton's method, which starts from a table. NaN beyond the largest angle."""
-    k, largest = lens.k, lens.largest_angle
-    angles = np.linspace(0, largest, _TABLE)
-    table = distort_angle(k, angles)
-    angle = np.interp(distorted_angle, table, angles)
-    for _ in range(3):
-        square = angle * angle
-        slope = 1 + square * (3 * k[0] + square * (5 * k[1] + square * (7 * k[2] + square * 9 * k[3])))
-        step = (distort_angle(k, angle) - distorted_angle) / np.maximum(slope, 1e-6)
-        angle = np.clip(angle - np.clip(step, -largest / _TABLE, largest / _TABLE), 0, largest)
-    return np.where(distorted_angle <= table[-1], angle, np.nan)
+    """Invert `distort_angle` by interpolation in a table, within 1e-4 pixels. NaN beyond the largest angle."""
+    angles = np.linspace(0, lens.largest_angle, _TABLE)
+    return np.interp(distorted_angle, distort_angle(lens.k, angles), angles, right=np.nan)
 
 
 class SensorView(NamedTuple):
