@@ -62,7 +62,7 @@ class Lit:
         return (self.boot, self.counter, self.levels) == (earlier.boot, earlier.counter, earlier.levels)
 
 
-class Leds:
+class Leds(contextlib.AbstractContextManager["Leds"]):
     """An open connection to the LED controller.
 
     ```python
@@ -100,21 +100,6 @@ class Leds:
     def find(cls, serial_number: str) -> "Leds":
         """Open the USB ports one after the other until the controller with a serial number answers."""
         return cls(_search(_usb_ports(serial_number), serial_number, timeout_s=5.0))
-
-    @property
-    def port(self) -> str:
-        """Name of the serial port."""
-        return self._connection.name
-
-    @property
-    def controller(self) -> protocol.Controller:
-        """Description of the controller: its firmware, its board and its serial number."""
-        return self._connection.controller
-
-    @property
-    def serial_number(self) -> str:
-        """Serial number that the controller reports."""
-        return self.controller.serial_number
 
     def set(self, levels: Sequence[int]) -> Lit:
         """Set the duty cycles of the four channels, 0 (off) to 255, and wait until the controller has applied them.
@@ -163,15 +148,15 @@ class Leds:
             time.sleep(wait)
             wait = min(2 * wait, _LONGEST_WAIT_S)
 
-    def __enter__(self) -> "Leds":
-        return self
-
     def __exit__(self, *error: object) -> None:
         self.close()
 
     def _start(self, connection: "Connection") -> None:
         """Turn the lights off, and start the background thread of requests."""
         self._connection = connection
+        self.port = connection.name  # name of the serial port
+        self.controller = connection.controller  # firmware, board and serial number of the controller
+        self.serial_number = self.controller.serial_number
         self._boot: int | None = None
         self._thread = threading.Thread(target=self._keep_alive, name=f"keep-alive of {self.port}", daemon=True)
         try:
@@ -371,11 +356,8 @@ def _open_port(name: str) -> serial.Serial:
 def _usb_port(name: str) -> ListPortInfo | None:
     """The USB port that a device name refers to, or None if it is not a USB port."""
     target = os.path.realpath(name)
-    for port in find_controllers():
-        with contextlib.suppress(OSError):
-            if port.vid is not None and os.path.realpath(port.device) == target:
-                return port
-    return None
+    ports = (port for port in find_controllers() if port.vid is not None)
+    return next((port for port in ports if os.path.realpath(port.device) == target), None)
 
 
 def checked_levels(levels: Sequence[int]) -> protocol.Levels:

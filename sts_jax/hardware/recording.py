@@ -55,7 +55,7 @@ class _Facts:
     origin: Origin
 
 
-class Recorder:
+class Recorder(contextlib.AbstractContextManager["Recorder"]):
     """Writes the images of a sensor to a folder. `Replay` plays the recording back.
 
     If the process is killed, the newest image of each stream is lost. A power failure can lose the last seconds.
@@ -148,9 +148,6 @@ class Recorder:
             self._end()
         files = {**self._manifest.files, **storage.checksums(self.folder, names)}
         storage.write_manifest(self.folder, files, self._manifest.facts)
-
-    def __enter__(self) -> "Recorder":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

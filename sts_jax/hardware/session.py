@@ -128,7 +128,7 @@ class Entry(NamedTuple):
     note: str  # text that was stored with the confirmation, may be empty
 
 
-class Session:
+class Session(contextlib.AbstractContextManager["Session"]):
     """A folder to which trajectories are added.
 
     When `save`, `confirm` or `discard` returns, the change is on disk and survives a loss of power. If it raises an
@@ -211,9 +211,6 @@ class Session:
     def close(self) -> None:
         """Unlock the folder."""
         self._lock.close()
-
-    def __enter__(self) -> "Session":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -9,7 +9,7 @@ import os
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Literal, Protocol, runtime_checkable
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -99,12 +99,6 @@ class Switch:
     thumbnails: Float[np.ndarray, "n 24 32 3"]  # thumbnail of each frame, 0 to 255
 
 
-@runtime_checkable
-class _Clock(Protocol):  # the module `time`, or the virtual clock of a twin
-    def monotonic(self) -> float: ...
-    def sleep(self, seconds: float, /) -> None: ...
-
-
 class STS:
     """A See-Through-your-Skin sensor.
 
@@ -127,7 +121,7 @@ class STS:
         exposures: tuple[float, float] | None = None,
         timeout_s: float = 5.0,
         reconnect_s: float = 30.0,
-        clock: _Clock = time,
+        clock: Any = time,
     ):
         """Keep the configuration. `connect` opens the devices.
 
@@ -142,7 +136,7 @@ class STS:
                 differ, the exposure is set at each switch of the lights, else never. None: not changed.
             timeout_s: Longest wait for one image (s), not counting the time of a reconnection.
             reconnect_s: Longest search for a controller that was lost (s).
-            clock: Clock of the devices.
+            clock: Clock of the devices, with the functions `monotonic` and `sleep` of the module `time`.
         """
         self.levels = checked_levels(levels)
         if isinstance(camera, str | int | Path):

@@ -61,7 +61,7 @@ class TwinFrame(NamedTuple):
     jpeg: bytes
 
 
-class Twin:
+class Twin(contextlib.AbstractContextManager["Twin"]):
     """A simulated sensor: LED controller, LEDs, scene and camera.
 
     A new twin runs on a virtual clock. Only `step`, `capture`, `set` and `ping` advance this clock, so the same calls
@@ -212,9 +212,6 @@ class Twin:
         """Wait for the end of a command, and close the files of the log. Closing twice is allowed."""
         with self._commands:  # a thread that renders while Python ends would abort the process
             self._files.close()
-
-    def __enter__(self) -> "Twin":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

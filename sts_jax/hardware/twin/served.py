@@ -140,7 +140,7 @@ class _Handler(web.Handler):
             server.clients.discard(frames)
 
 
-class Served:
+class Served(contextlib.AbstractContextManager["Served"]):
     """A running server through which other processes use a `Twin` like a real sensor.
 
     ```python
@@ -212,9 +212,6 @@ class Served:
         for thread in self._threads:
             thread.join()
         self._leds.close()
-
-    def __enter__(self) -> "Served":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
