@@ -99,7 +99,7 @@ def test_a_session_is_continued_and_its_trajectories_discarded_restored_and_conf
     [
         (lambda folder: hardware.load_recordings(folder.parent), FileNotFoundError, "holds no session"),
         (lambda folder: Session(folder.parent), FileNotFoundError, "holds no session"),
-        (lambda folder: Session(folder, OTHER), ValueError, "recorded with leds = '0123', but this sensor has leds = "),
+        (lambda folder: Session(folder, OTHER), ValueError, "leds = '0123', but the current settings have leds"),
         (lambda folder: hardware.load_recordings(folder).images(), ValueError, "no confirmed trajectory"),
         (lambda folder: Session(folder).confirm(0), FileNotFoundError, "it has no final pair"),
         (lambda folder: Session(folder).restore(7), FileNotFoundError, "list the trajectories"),

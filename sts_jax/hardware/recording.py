@@ -174,13 +174,9 @@ class Replay:
         self._stills = _recorded(self.folder)
         if not self._stills:
             raise ValueError(f"{self.folder} has no image: make a new recording.")
+        self.device = Device.load(folder) if sensor_file(folder).exists() else None  # None: without a `sensor.json`
         self._shots: Iterator[Shot] | None = None
         self.skipped = 0  # images that were left out because the program read too slowly
-
-    @property
-    def device(self) -> Device | None:
-        """The recorded sensor, or None if the recording has no `sensor.json`."""
-        return Device.load(self.folder) if sensor_file(self.folder).exists() else None
 
     def connect(self) -> "Replay":
         """Start the replay, or start it again from the beginning."""

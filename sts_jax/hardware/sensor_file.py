@@ -5,15 +5,14 @@
 
 import dataclasses
 import hashlib
-import io
 import os
 import shutil
 from pathlib import Path
 from typing import Annotated, Literal
 
+import cv2
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image
 from pydantic import Field
 
 from sts_jax import storage
@@ -93,9 +92,7 @@ class Device:
         for name, image in zip(BACKGROUNDS, backgrounds or (), strict=False):
             if image.shape != shape:
                 raise ValueError(f"a background has shape {image.shape}, but the lens {shape}")
-            buffer = io.BytesIO()
-            Image.fromarray(image).save(buffer, "PNG", compress_level=3)
-            written[name] = buffer.getvalue()
+            written[name] = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
         written[file.name] = storage.json_bytes({**sensor.constants(), "device": content})
         checksums = {name: hashlib.sha256(data).hexdigest() for name, data in written.items()}
         files = checksums if manifest is None else {**manifest.files, **checksums}
@@ -121,11 +118,8 @@ class Device:
         file = sensor_file(path)
         if not set(BACKGROUNDS) <= checksums(file).keys():
             return None
-        visual, tactile = (np.asarray(Image.open(file.with_name(name))) for name in BACKGROUNDS)
-        for name, image in zip(BACKGROUNDS, (visual, tactile), strict=True):
-            if image.shape != (self.lens.height, self.lens.width, 3):
-                size = f"{self.lens.width} x {self.lens.height}"
-                raise ValueError(f"{file.with_name(name)} is no RGB image of {size} pixels: {_AGAIN}.")
+        paths = [str(file.with_name(name)) for name in BACKGROUNDS]
+        visual, tactile = (np.asarray(cv2.imread(path, cv2.IMREAD_COLOR_RGB)) for path in paths)
         return visual, tactile
 
     def check_identity(self, *, camera: str | None = None, leds: str | None = None) -> None:

@@ -221,12 +221,8 @@ def _prepare(folder: Path, origin: Origin | None) -> Origin:
     if origin is not None and not (folder / MANIFEST).exists():
         storage.write_manifest(folder, {}, dataclasses.asdict(origin))
     recorded = _read_origin(folder)
-    now, before = dataclasses.asdict(origin or recorded), dataclasses.asdict(recorded)
-    if changed := [name for name in now if now[name] != before[name]]:
-        raise ValueError(
-            f"{folder} was recorded with {', '.join(f'{name} = {before[name]!r}' for name in changed)}, but this "
-            f"sensor has {', '.join(f'{name} = {now[name]!r}' for name in changed)}: choose another folder."
-        )
+    if changes := storage.differences(dataclasses.asdict(recorded), dataclasses.asdict(origin or recorded)):
+        raise ValueError(f"{folder} was recorded with {changes}: choose another folder.")
     for kind in (_TRAJECTORIES, _DISCARDED):
         (folder / kind).mkdir(exist_ok=True)
     storage.flush_folder(folder)
@@ -255,8 +251,6 @@ def _numbered(folder: Path) -> Iterator[tuple[str, int, Path]]:
 def _move(source: Path, target: Path) -> None:
     if not source.is_dir():
         raise FileNotFoundError(f"{source} does not exist: list the trajectories with list_recordings().")
-    if target.exists():
-        raise FileExistsError(f"{source} cannot be moved to {target}, which exists already: remove one of the two.")
     source.rename(target)
     storage.flush_folder(target.parent)
     storage.flush_folder(source.parent)
@@ -367,10 +361,9 @@ def _read_pair(path: Path, size: tuple[int, int], remedy: str) -> Pair:
     assert manifest is not None  # the manifest of the trajectory lists it
     shots = []
     for stream in _STREAMS:
-        decoded = cv2.imread(str(path / f"{stream}.png"), cv2.IMREAD_COLOR)
-        if decoded is None or decoded.shape[:2] != size:
+        image = cv2.imread(str(path / f"{stream}.png"), cv2.IMREAD_COLOR_RGB)
+        if image is None or image.shape[:2] != size:
             raise DamagedFileError(f"{path / f'{stream}.png'} is no image of {size[1]} x {size[0]} pixels: {remedy}.")
-        image = cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB)
         image.flags.writeable = False
         shots.append(shot_of(image, stream, manifest.facts[stream]))
     return Pair(*shots)
