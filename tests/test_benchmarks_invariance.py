@@ -15,9 +15,7 @@ pytestmark = pytest.mark.slow
 NUM = 128  # four full chunks
 
 
-@pytest.mark.parametrize(
-    "index", [pytest.param(1, marks=pytest.mark.long, id="bottle"), pytest.param(2, id="jerked bottles")]
-)  # the box is dropped as the bottle is
+@pytest.mark.parametrize("index", [1, 2], ids=["bottle", "jerked bottles"])  # the box is dropped as the bottle is
 def test_ends_do_not_depend_on_step_engine_or_handedness(index: int) -> None:
     case = invariance.cases()[index]
     case = case._replace(
