@@ -251,6 +251,8 @@ def _numbered(folder: Path) -> Iterator[tuple[str, int, Path]]:
 def _move(source: Path, target: Path) -> None:
     if not source.is_dir():
         raise FileNotFoundError(f"{source} does not exist: list the trajectories with list_recordings().")
+    if target.exists():
+        raise FileExistsError(f"{source} cannot be moved to {target}, which exists already: remove one of the two.")
     source.rename(target)
     storage.flush_folder(target.parent)
     storage.flush_folder(source.parent)
