@@ -26,6 +26,7 @@ import sts_jax as sts
 from benchmarks.instruments.experiments import EXPERIMENTS
 from experiments.shared import run
 from sts_jax import dataset, evaluation, statespace, storage, training
+from sts_jax.statespace import blocks
 
 BATCH, RATE, WARMUP = 32, 1e-3, 100
 POSE_WEIGHT, TACTILE_WEIGHT, OUTCOME_WEIGHT = 300.0, 4.0, 8.0  # the visual image's cross-entropy (nat) has weight 1
@@ -60,25 +61,15 @@ class Network(nnx.Module):
         """Predict the last state from the arrays of `features`."""
         x = images
         for layer in self.down:
-            x = jax.nn.swish(layer(_fold(x)))
+            x = jax.nn.swish(layer(blocks.fold(x)))
         x = self.join(jnp.concatenate([x.reshape(len(x), -1), numbers], axis=-1))
         for norm, layer in zip(self.norms, self.layers, strict=True):
             x = x + layer(jax.nn.swish(norm(x)))
         final = self.numbers(x)
         picture = self.core(x).reshape(len(x), 8, 8, -1)
         for layer in self.up:
-            picture = _unfold(layer(jax.nn.swish(picture)))
+            picture = blocks.unfold(layer(jax.nn.swish(picture)))
         return picture, final[:, :12], final[:, 12:]
-
-
-def _fold(x: Float[Array, "n h w c"]) -> Float[Array, "n h/2 w/2 4*c"]:
-    n, h, w, c = x.shape
-    return x.reshape(n, h // 2, 2, w // 2, 2, c).swapaxes(2, 3).reshape(n, h // 2, w // 2, 4 * c)
-
-
-def _unfold(x: Float[Array, "n h w c"]) -> Float[Array, "n 2*h 2*w c/4"]:
-    n, h, w, c = x.shape
-    return x.reshape(n, h, w, 2, 2, c // 4).swapaxes(2, 3).reshape(n, 2 * h, 2 * w, c // 4)
 
 
 def features(inputs: dict[str, Array], condition: Array | None, empty: dict[str, Array]) -> tuple[Array, Array]:

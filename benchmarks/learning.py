@@ -107,7 +107,7 @@ def roller(steps: int) -> Callable[[], None]:
 
 def state_stepper(size: int) -> Callable[[], None]:
     """Make a function that runs one training step of a state-space model on random data."""
-    rng, model = np.random.default_rng(0), statespace.Config()
+    rng, model = np.random.default_rng(0), statespace.Config(imprints=True, shading=24, outlines=32)
     config = training.TrainConfig(batch_size=size)
 
     def images(count: int, side: int) -> np.ndarray:

@@ -13,11 +13,11 @@ ROOMS = [
     for name, paths, lines, budget in re.findall(r"^\| ([^|`]+) \| (`[^|]+) \| ([\d,]+) \| ([\d,]+) \|$", PAGE, re.M)
 ]
 TOTALS = {
-    "library without hardware": 26_530,
+    "library without hardware": 26_730,
     "hardware": 5_060,
     "experiments": 7_420,
     "benchmarks": 5_800,
-    "tests": 26_270,
+    "tests": 26_400,
 }
 
 

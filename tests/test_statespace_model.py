@@ -6,7 +6,6 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 from flax import nnx
 from scipy import special, stats
@@ -220,52 +219,6 @@ def test_share_of_levels_that_cover_a_pixel_is_its_probability():
     np.testing.assert_allclose(softer, np.broadcast_to(odds / (1 + odds), softer.shape), rtol=1e-3, atol=1e-6)
 
 
-def test_shading_finds_the_edges_of_an_imprint_from_its_outline():
-    rng = np.random.default_rng(0)
-    outline = np.zeros((60, 16, 16, 1), np.float32)
-    for image, (row, column, height, width) in zip(
-        outline, rng.integers([2, 2, 4, 4], [7, 7, 9, 9], (60, 4)), strict=True
-    ):
-        image[row : row + height, column : column + width] = 1
-    # the first column inside is dark, the last one is bright
-    change = 2 * (np.roll(outline, 1, axis=2) - np.roll(outline, -1, axis=2)) * outline
-    outline, flat, grey = jnp.asarray(outline), jnp.zeros((60, 16, 16, 3)), jnp.full((16, 16, 3), 0.5)
-    target = networks.imprinted(flat + change, outline, grey)
-    graphdef, params = nnx.split(networks.Shading(8, nnx.Rngs(0)))
-
-    def error(params, some):
-        shaded = networks.imprinted(flat[some], outline[some], grey, nnx.merge(graphdef, params))
-        return jnp.mean(objective.excess(shaded, target[some]))
-
-    optimiser = optax.adam(0.02)
-    train, other, moments = slice(40), slice(40, None), optimiser.init(params)
-    before = error(params, other)
-
-    @jax.jit
-    def step(params, moments):
-        updates, moments = optimiser.update(jax.grad(error)(params, train), moments)
-        return optax.apply_updates(params, updates), moments
-
-    for _ in range(150):
-        params, moments = step(params, moments)
-    assert error(params, other) < 0.1 * before
-
-
-@pytest.mark.slow  # compiles a loss of its own
-def test_shading_is_trained_by_the_true_outline_and_trains_nothing_else(batch):
-    graphdef, params, _ = statespace.init(jax.random.key(0), dataclasses.replace(CONFIG, imprints=True, shading=4))
-
-    @jax.jit
-    @jax.grad
-    def slope(params):
-        return statespace.loss(graphdef, params, jax.random.key(0), **batch)[1]["shaded"]
-
-    found = nnx.to_pure_dict(slope(params))
-    shading = found["decoder"].pop("shading")
-    assert all(np.any(x) for x in jax.tree.leaves(shading))
-    assert not any(np.any(x) for x in jax.tree.leaves(found))
-
-
 def test_belief_from_the_true_state_is_the_true_state(model, empty, batch):
     inputs = {"visual": batch["inputs"]["visual"], "state": batch["targets"]["state"]}
     counts = {name: jnp.ones(NUMBER, bool) for name in inputs}
@@ -431,6 +384,10 @@ def test_half_of_the_trajectories_are_reflected_with_their_turns_and_jerks(batch
         ({"window": 12}, "window must be a positive multiple of 8 pixels, got 12"),
         ({"input_size": 24}, "input_size must be a positive multiple of 16 pixels, the image_size, got 24"),
         ({"shading": 4}, "shading must be 0, or >= 1 with imprints=True and an even image_size, got shading=4"),
+        (
+            {"imprints": True, "outlines": 4},
+            "outlines must be 0, or >= 1 with shading >= 1, got outlines=4 and shading=0",
+        ),
         ({"condition": 1}, r"condition must be >= 2 \* vectors >= 0, got condition=1 and vectors=1"),
         ({"outcome_names": ("rests",)}, "outcome_names must be empty or have 3 names"),
         ({"weights": {"touch": 1.0}}, r"field model\.weights\.touch is unknown"),

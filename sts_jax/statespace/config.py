@@ -54,6 +54,9 @@ class Config:
     imprints: bool = False
     # channels of a network that adjusts an imprint to its outline in a sample, which `imprints` must predict. 0: none
     shading: int = 0
+    # channels of a network that draws the outline and the depth of an imprint in a sample, for which `shading` adds the
+    # edges. 0: the outline is where the probability of an imprint is above a random level
+    outlines: int = 0
     # True: in the training of the transition, every second trajectory is reflected (x -> -x). This is right if the
     # scenario has no preferred side
     reflected: bool = False
@@ -86,6 +89,11 @@ class Config:
             raise ValueError(
                 f"shading must be 0, or >= 1 with imprints=True and an even image_size, got shading={self.shading}, "
                 f"imprints={self.imprints} and image_size={self.image_size}"
+            )
+        if self.outlines < 0 or (self.outlines and not self.shading):
+            raise ValueError(
+                f"outlines must be 0, or >= 1 with shading >= 1, got outlines={self.outlines} and "
+                f"shading={self.shading}"
             )
         if self.stride < 0 or (self.stride and self.outcomes != 1):
             raise ValueError(

@@ -13,7 +13,7 @@ into channels. To enlarge an image, channels are unfolded into blocks of pixels.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,8 +22,8 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from sts_jax import objects
 from sts_jax._checked import in_32_bits
-from sts_jax.mvae import Gaussian, convolutions, product_of_experts
-from sts_jax.statespace import harmonics, poses, state, window
+from sts_jax.mvae import Gaussian, product_of_experts
+from sts_jax.statespace import blocks, harmonics, imprints, poses, state, window
 from sts_jax.statespace.config import IMAGES, TINT, Config
 
 UNKNOWN_LOG_VAR = 30.0  # log variance of numbers that an input does not determine: their precision is almost 0
@@ -44,7 +44,6 @@ _OUTSIDE = 8.0  # difference of the logit of being covered by the object, betwee
 _MIDDLE, _WIDTH = -0.3, 0.12
 _TINT_LOG_VAR = -6.0  # log variance of a tint that was measured in an image
 _BRIGHT = 0.7  # approximate brightness of the empty sensor
-_SMALL = nnx.initializers.variance_scaling(0.1, "fan_in", "normal")  # for last layers
 
 
 class FinalPose(NamedTuple):
@@ -70,6 +69,7 @@ class Layers(NamedTuple):
     touch: Float[Array, "n size size 3"]  # change of the logits of the tactile image, where it shows an imprint
     # Logit of the probability that a pixel of the tactile image shows an imprint. None: it is 1
     pressed: Float[Array, "n size size 1"] | None = None
+    mass: Float[Array, "n 1"] | None = None  # as in a state code, for imprints
 
 
 def compose(
@@ -77,7 +77,8 @@ def compose(
     empty: dict[str, Float[Array, "size size 3"]],
     level: Float[Array, "n"] | None = None,
     contrast: float | Float[Array, "n"] = CONTRAST,
-    shading: "Shading | None" = None,
+    decoder: "Decoder | None" = None,
+    noise: Float[Array, "n noise"] | None = None,
 ) -> dict[str, Float[Array, "n size size 3"]]:
     """Combine the rendered objects with the images of the empty sensor, of the same size.
 
@@ -90,7 +91,8 @@ def compose(
         empty: `visual` and `tactile` image of the empty sensor in [0, 1].
         level: Threshold for each object, from 0 to 1, or None.
         contrast: Sharpness of the outlines if there is a threshold.
-        shading: The decoder's, for a tactile image that follows the outline of the imprint.
+        decoder: The decoder of the layers, for tactile images whose imprints it draws (`Decoder.imprint`).
+        noise: Random numbers for each object from which an imprint is drawn, or None for the mean imprint.
 
     Returns:
         The images `visual` and `tactile` of each object, in [0, 1].
@@ -103,10 +105,12 @@ def compose(
         return jax.nn.sigmoid(jnp.reshape(contrast, (-1, 1, 1, 1)) * (logit - jnp.log(limit / (1 - limit))))
 
     covered = outlined(layers.covered)
-    pressed = None if layers.pressed is None else outlined(layers.pressed)
+    pressed, touch = None if layers.pressed is None else outlined(layers.pressed), layers.touch
+    if pressed is not None and decoder is not None:
+        pressed, touch = decoder.imprint(layers, pressed, noise)
     return {
         "visual": covered * layers.colour + (1 - covered) * empty["visual"],
-        "tactile": imprinted(layers.touch, pressed, empty["tactile"], shading),
+        "tactile": imprinted(touch, pressed, empty["tactile"]),
     }
 
 
@@ -114,44 +118,11 @@ def imprinted(
     touch: Float[Array, "n size size 3"],
     pressed: Float[Array, "n size size 1"] | None,
     empty: Float[Array, "size size 3"],
-    shading: "Shading | None" = None,
 ) -> Float[Array, "n size size 3"]:
     """Tactile images in [0, 1]: the changes `touch` of the logits, where the weights `pressed` show an imprint."""
     grey = jnp.clip(empty, 0.01, 0.99)
-    if shading is not None and pressed is not None:
-        touch = touch + shading(pressed, touch)
     image = jax.nn.sigmoid(jnp.log(grey / (1 - grey)) + touch)
     return image if pressed is None else pressed * image + (1 - pressed) * empty
-
-
-def _conv(x: Array, kernel: Array, *args: Any, **options: Any) -> Array:
-    """The convolution of `nnx.Conv` with a 3x3 kernel. On a CPU, its gradient is faster than XLA's."""
-    if jax.default_backend() != "cpu":
-        return jax.lax.conv_general_dilated(x, kernel, *args, **options)
-    return convolutions.conv(x, kernel, 1, 1)
-
-
-class _Residual(nnx.Module):
-    """`x + layer(swish(norm(x)))` with a 3x3 convolution."""
-
-    def __init__(self, channels: int, rngs: nnx.Rngs) -> None:
-        self.norm = nnx.LayerNorm(channels, rngs=rngs)
-        self.layer = nnx.Conv(channels, channels, (3, 3), conv_general_dilated=_conv, rngs=rngs)
-
-    def __call__(self, x: Array) -> Array:
-        return x + self.layer(jax.nn.swish(self.norm(x)))
-
-
-class _ResidualDense(nnx.Module):
-    """A residual block of two fully connected layers."""
-
-    def __init__(self, width: int, rngs: nnx.Rngs) -> None:
-        self.norm = nnx.LayerNorm(width, rngs=rngs)
-        self.first = nnx.Linear(width, width, rngs=rngs)
-        self.second = nnx.Linear(width, width, kernel_init=_SMALL, rngs=rngs)
-
-    def __call__(self, x: Array) -> Array:
-        return x + self.second(jax.nn.swish(self.first(jax.nn.swish(self.norm(x)))))
 
 
 def parts(config: Config, look: Float[Array, "n look"]) -> tuple[Array, Array, Array]:
@@ -182,18 +153,6 @@ def _joined(*features: Float[Array, "n ..."]) -> Float[Array, "n k"]:
     return jnp.concatenate([x.reshape(len(x), -1) for x in features], axis=-1)
 
 
-def _fold(x: Float[Array, "n h w c"]) -> Float[Array, "n h//2 w//2 4*c"]:
-    """Turn each block of 2x2 pixels into one pixel with four times as many channels."""
-    n, h, w, c = x.shape
-    return x.reshape(n, h // 2, 2, w // 2, 2, c).transpose(0, 1, 3, 2, 4, 5).reshape(n, h // 2, w // 2, 4 * c)
-
-
-def _unfold(x: Float[Array, "n h w c"]) -> Float[Array, "n 2*h 2*w c//4"]:
-    """The inverse of `_fold`."""
-    n, h, w, c = x.shape
-    return x.reshape(n, h, w, 2, 2, c // 4).transpose(0, 1, 3, 2, 4, 5).reshape(n, 2 * h, 2 * w, c // 4)
-
-
 class Encoder(nnx.Module):
     """Estimates the state code and the appearance code from a visual or from a tactile image.
 
@@ -204,17 +163,17 @@ class Encoder(nnx.Module):
         self.config = config
         self.name = name
         half, quarter, eighth = config.encoder
-        self.first = nnx.Conv(12, half, (3, 3), conv_general_dilated=_conv, rngs=rngs)
-        self.halves = nnx.List([_Residual(half, rngs) for _ in range(2)])
+        self.first = nnx.Conv(12, half, (3, 3), conv_general_dilated=blocks.conv, rngs=rngs)
+        self.halves = nnx.List([blocks.Residual(half, rngs) for _ in range(2)])
         self.to_quarter = nnx.Linear(4 * half, quarter, rngs=rngs)
-        self.quarters = nnx.List([_Residual(quarter, rngs) for _ in range(2)])
+        self.quarters = nnx.List([blocks.Residual(quarter, rngs) for _ in range(2)])
         self.to_eighth = nnx.Linear(4 * quarter, eighth, rngs=rngs)
-        self.eighth = _Residual(eighth, rngs)
+        self.eighth = blocks.Residual(eighth, rngs)
         self.place = nnx.Linear(7, 64, rngs=rngs)
         self.dense = nnx.Linear((config.window // 8) ** 2 * eighth + 64, config.hidden, rngs=rngs)
-        self.residual = _ResidualDense(config.hidden, rngs)
+        self.residual = blocks.ResidualDense(config.hidden, rngs)
         self.norm = nnx.LayerNorm(config.hidden, rngs=rngs)
-        self.last = nnx.Linear(config.hidden, 2 * (state.CODE + config.look), kernel_init=_SMALL, rngs=rngs)
+        self.last = nnx.Linear(config.hidden, 2 * (state.CODE + config.look), kernel_init=blocks.SMALL, rngs=rngs)
 
     def __call__(self, change: Float[Array, "n size size 3"]) -> Gaussian:
         """Estimate the codes of each image: a Gaussian `(n, code + look)`.
@@ -224,13 +183,13 @@ class Encoder(nnx.Module):
         """
         config = self.config
         place = window.locate(jax.lax.stop_gradient(change))
-        x = self.first(_fold(3 * window.cut(change, place, config.window)))
+        x = self.first(blocks.fold(3 * window.cut(change, place, config.window)))
         for layer in self.halves:
             x = layer(x)
-        x = self.to_quarter(_fold(x))
+        x = self.to_quarter(blocks.fold(x))
         for layer in self.quarters:
             x = layer(x)
-        x = jax.nn.swish(self.eighth(self.to_eighth(_fold(x))))
+        x = jax.nn.swish(self.eighth(self.to_eighth(blocks.fold(x))))
         # The network works in the coordinate frame of the silhouette. The estimate is rotated into the sensor frame.
         centre = poses.turn_back(place.angle, (place.centre - 0.5) * config.view / config.position_scale)
         side = place.side[:, None]
@@ -280,11 +239,11 @@ class Transition(nnx.Module):
         number += 2 * poses.MOTION + 1 if config.stride else 0
         self.size = poses.MOTION if config.stride else poses.MOVE
         self.first = nnx.Linear(number, config.transition, rngs=rngs)
-        self.layers = nnx.List([_ResidualDense(config.transition, rngs) for _ in range(3)])
+        self.layers = nnx.List([blocks.ResidualDense(config.transition, rngs) for _ in range(3)])
         self.norm = nnx.LayerNorm(config.transition, rngs=rngs)
-        self.outcome = nnx.Linear(config.transition, config.outcomes, kernel_init=_SMALL, rngs=rngs)
+        self.outcome = nnx.Linear(config.transition, config.outcomes, kernel_init=blocks.SMALL, rngs=rngs)
         components = config.outcomes * config.components * (1 + 2 * self.size)
-        self.mixture = nnx.Linear(config.transition, components, kernel_init=_SMALL, rngs=rngs)
+        self.mixture = nnx.Linear(config.transition, components, kernel_init=blocks.SMALL, rngs=rngs)
 
     def __call__(
         self, belief: Gaussian, condition: Float[Array, "n c"] | None, velocity: Float[Array, "n 6"] | None = None
@@ -357,13 +316,15 @@ class Decoder(nnx.Module):
         eighth, quarter, half = config.decoder
         shapes = 2 * config.support + (config.own + config.shown) * config.directions
         self.first = nnx.Linear(poses.CODE + 4 + config.traits + shapes, 512, rngs=rngs)
-        self.residual = _ResidualDense(512, rngs)
+        self.residual = blocks.ResidualDense(512, rngs)
         self.core = nnx.Linear(512, (config.canvas // 8) ** 2 * (eighth // 2), rngs=rngs)
         self.widen = nnx.Linear(eighth // 2, eighth, rngs=rngs)
-        self.layers = nnx.List([_Residual(width, rngs) for width in (eighth, quarter, half)])
+        self.layers = nnx.List([blocks.Residual(width, rngs) for width in (eighth, quarter, half)])
         self.enlarge = nnx.List([nnx.Linear(a, 4 * b, rngs=rngs) for a, b in ((eighth, quarter), (quarter, half))])
-        self.last = nnx.Conv(half, 4 * 8, (3, 3), kernel_init=_SMALL, conv_general_dilated=_conv, rngs=rngs)
-        self.shading = Shading(config.shading, rngs) if config.shading else None
+        self.last = nnx.Conv(half, 4 * 8, (3, 3), kernel_init=blocks.SMALL, conv_general_dilated=blocks.conv, rngs=rngs)
+        features = imprints.FEATURES if config.outlines else 0
+        self.shading = imprints.Shading(config.shading, features, rngs) if config.shading else None
+        self.outlines = imprints.Outlines(config.outlines, rngs) if config.outlines else None
 
     def __call__(
         self,
@@ -393,8 +354,8 @@ class Decoder(nnx.Module):
         x = self.core(jax.nn.swish(self.residual(self.first(x))))
         x = self.widen(x.reshape(len(x), config.canvas // 8, config.canvas // 8, -1))
         for layer, enlarge in zip(self.layers, self.enlarge, strict=False):
-            x = _unfold(enlarge(layer(x)))
-        x = _unfold(self.last(jax.nn.swish(self.layers[-1](x)))).at[..., 3::4].add(_OUTSIDE)
+            x = blocks.unfold(enlarge(layer(x)))
+        x = blocks.unfold(self.last(jax.nn.swish(self.layers[-1](x)))).at[..., 3::4].add(_OUTSIDE)
         depth = config.camera_distance + jnp.maximum(pose[:, 2] * config.position_scale - state.reach(shape, turn), 0)
         x = window.sample(x, _on_canvas(config, pose, heading, depth))
         x = x.reshape(len(x), config.image_size, config.image_size, -1)
@@ -402,30 +363,25 @@ class Decoder(nnx.Module):
         tint = jnp.clip(_BRIGHT + _MIDDLE + _WIDTH * look[:, None, None, :TINT], 0.03, 0.97)
         colour = jax.nn.sigmoid(x[..., :3] + jnp.log(tint / (1 - tint)))
         covered, pressed = (x[..., i : i + 1] - _OUTSIDE - 3 for i in (3, 7))
-        return Layers(covered, colour, touch=x[..., 4:7], pressed=pressed if config.imprints else None)
+        return Layers(covered, colour, x[..., 4:7], pressed if config.imprints else None, shape.mass)
 
+    def imprint(
+        self, layers: Layers, pressed: Float[Array, "n size size 1"], noise: Float[Array, "n noise"] | None = None
+    ) -> tuple[Float[Array, "n size size 1"], Float[Array, "n size size 3"]]:
+        """The weights of the imprints and the changes of the logits of the tactile images.
 
-class Shading(nnx.Module):
-    """Corrects the change of a tactile image by the outline of the imprint, whose edges reflect the lights.
-
-    The decoder knows the edges of an imprint only as probabilities, and therefore predicts the mean over their possible
-    places. For one outline, the edges are at known places.
-    """
-
-    def __init__(self, width: int, rngs: nnx.Rngs) -> None:
-        self.layers = nnx.List(
-            [nnx.Conv(a, width, (3, 3), conv_general_dilated=_conv, rngs=rngs) for a in (4 * 4, width)]
-        )
-        self.last = nnx.Conv(width, 4 * 3, (3, 3), kernel_init=_SMALL, conv_general_dilated=_conv, rngs=rngs)
-
-    def __call__(
-        self, pressed: Float[Array, "n size size 1"], touch: Float[Array, "n size size 3"]
-    ) -> Float[Array, "n size size 3"]:
-        """The correction of the changes `touch` of the logits. `pressed` is the weight of the imprint in each pixel."""
-        x = _fold(jnp.concatenate([pressed, pressed * touch], axis=-1))
-        for layer in self.layers:
-            x = jax.nn.swish(layer(x))
-        return _unfold(self.last(x))
+        With `Config.outlines`, they are drawn from `noise`, or the means if it is None. Without, the changes follow the
+        outlines `pressed`.
+        """
+        touch = layers.touch
+        if self.shading is None:
+            return pressed, touch
+        if self.outlines is None:
+            return pressed, touch + self.shading(pressed, touch)
+        if noise is None or layers.pressed is None or layers.mass is None:
+            return pressed, touch
+        pressed, features, depth = self.outlines(layers.pressed, touch, layers.mass, noise)
+        return pressed, depth[:, None, None, None] * (touch + self.shading(pressed, touch, features))
 
 
 def _on_canvas(

@@ -9,7 +9,8 @@
 - `first`: the sum of the terms `visual` and `tactile`, but computed for the input images of the first frame
 - `covered`: the cross-entropy of the probability that a pixel shows the object, for both frames, and with
   `Config.imprints` that of the probability that a pixel of the tactile image shows an imprint
-- `shaded`: with `Config.shading`, the term `tactile` of images with the true outline of the imprint
+- `shaded`: with `Config.shading`, the term `tactile` of images with the true outline of the imprint. With
+  `Config.outlines` in its place `imprint`: the energy score of drawn images of the last frame
 - `look`: the divergence of the appearance code from its prior, multiplied by `beta` in the loss
 
 The decoder renders the object in its true pose in each of the two frames. It therefore never learns a mean of images
@@ -39,11 +40,12 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from sts_jax._checked import in_32_bits
 from sts_jax.mvae import Gaussian, kl_standard_normal
-from sts_jax.statespace import poses, state, window
+from sts_jax.statespace import imprints, poses, state, window
 from sts_jax.statespace.config import IMAGES, TINT, Config
 from sts_jax.statespace.networks import (
     EXACT_LOG_VAR,
     FinalPose,
+    Layers,
     Model,
     compose,
     counted,
@@ -241,6 +243,7 @@ def loss(
     total = (
         terms["visual"]
         + weights.tactile * (terms["tactile"] + terms.get("shaded", 0))
+        + terms.get("imprint", 0)
         + weights.covered * terms["covered"]
         + weights.first * terms["first"]
         + weights.state * terms["state"]
@@ -445,10 +448,13 @@ def _picture_terms(
     if layers.pressed is not None:
         imprint = window.shows(after.images["tactile"] - small["tactile"])
         terms["covered"] += jnp.mean(_outline_nats(layers.pressed[:number], imprint))
-        if model.decoder.shading is not None:
-            # The true outline alone trains the shading, and the shading trains nothing else.
-            change = jax.lax.stop_gradient(layers.touch[:number])
-            shaded = imprinted(change, imprint[..., None], small["tactile"], model.decoder.shading)
+        # These terms train the networks that draw imprints, and nothing else.
+        fixed = jax.tree.map(lambda x: jax.lax.stop_gradient(x[:number]), layers)
+        if model.decoder.outlines is not None:
+            terms["imprint"] = _imprint_term(model, keys[0], fixed, after.images["tactile"], small["tactile"])
+        elif model.decoder.shading is not None:
+            weight, touch_there = model.decoder.imprint(fixed, imprint[..., None])
+            shaded = imprinted(touch_there, weight, small["tactile"])
             terms["shaded"] = jnp.mean(excess(shaded, after.images["tactile"]))
     for name, image in before.images.items():
         counts = before.counts[name]
@@ -463,6 +469,22 @@ def _picture_terms(
             if layers.pressed is not None:
                 terms["covered"] += jnp.sum(share * _outline_nats(layers.pressed[number:], seen))
     return terms
+
+
+def _imprint_term(
+    model: Model,
+    key: PRNGKeyArray,
+    layers: Layers,
+    target: Float[Array, "n size size 3"],
+    empty: Float[Array, "size size 3"],
+) -> Float[Array, ""]:
+    """The term `imprint`, from two drawn images of each object."""
+    noise, place = jax.random.split(jax.random.fold_in(key, 2))
+    twice = jax.tree.map(lambda x: jnp.concatenate([x, x]), layers)
+    drawn = jax.random.normal(noise, (2 * len(target), imprints.NOISE))
+    pressed, touch = model.decoder.imprint(twice, twice.pressed, drawn)
+    one, other = jnp.split(imprinted(touch, pressed, empty), 2)
+    return jnp.mean(imprints.energy_score(one, other, target, jax.random.randint(place, (2,), 0, 8)))
 
 
 def _outline_nats(logit: Float[Array, "n h w 1"], seen: Float[Array, "n h w"]) -> Float[Array, "n"]:

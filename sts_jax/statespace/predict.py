@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 from sts_jax._checked import in_32_bits
 from sts_jax.mvae import Gaussian
-from sts_jax.statespace import poses, state
+from sts_jax.statespace import imprints, poses, state
 from sts_jax.statespace.config import Config
 from sts_jax.statespace.networks import (
     CONTRAST,
@@ -133,9 +133,9 @@ def sample(
     contrast = jnp.full(len(samples.outcome), CONTRAST)
     if correction is not None:
         contrast = of_items(model.config, correction, present).contrast
-    shading = model.decoder.shading
-    sharp = compose(samples.layers, samples.empty, samples.level, jnp.tile(contrast, drawn), shading)
-    soft = compose(samples.layers, samples.empty, shading=shading)
+    contrasts = jnp.tile(contrast, drawn)
+    sharp = compose(samples.layers, samples.empty, samples.level, contrasts, model.decoder, samples.noise)
+    soft = compose(samples.layers, samples.empty, decoder=model.decoder)
     return Samples(
         belief=samples.belief,
         outcome=samples.outcome,
@@ -153,6 +153,7 @@ class Drawn(NamedTuple):
     pose: Float[Array, "k n 12"]  # pose codes of the last frame
     layers: Layers  # outlines and colours, drawn * n, with the axis of the trajectories last
     level: Float[Array, "m"]  # threshold of each outline, drawn * n
+    noise: Float[Array, "m noise"]  # random numbers of each imprint, drawn * n
     empty: dict[str, Float[Array, "size size 3"]]  # images of the empty sensor with the size of the layers
 
 
@@ -176,7 +177,7 @@ def draw(
     looks, level = drawn_looks(appearance, belief, drawn), drawn_levels(outline, drawn)
     layers = rendered(model, belief, looks, codes[:drawn], turns[:drawn])
     shown = {name: reduced(x, model.config.image_size) for name, x in empty.items()}
-    return Drawn(belief, jnp.exp(final.outcome), codes, layers, level, shown)
+    return Drawn(belief, jnp.exp(final.outcome), codes, layers, level, drawn_noise(outline, drawn), shown)
 
 
 def drawn_looks(key: Key[Array, "n"], belief: Gaussian, num: int) -> Float[Array, "num n look"]:
@@ -193,6 +194,15 @@ def drawn_levels(key: Key[Array, "n"], num: int) -> Float[Array, "m"]:
     """
     order = jax.vmap(lambda key: jax.random.permutation(key, num), out_axes=1)(key)
     return (order.reshape(-1) + 0.5) / num
+
+
+def drawn_noise(key: Key[Array, "n"], num: int) -> Float[Array, "m noise"]:
+    """Random numbers of each of num * n imprints, see `imprints.Outlines`."""
+
+    def of_item(key: Key[Array, ""]) -> Float[Array, "num noise"]:
+        return jax.random.normal(jax.random.fold_in(key, 1), (num, imprints.NOISE))
+
+    return jax.vmap(of_item, out_axes=1)(key).reshape(-1, imprints.NOISE)
 
 
 def rendered(

@@ -21,7 +21,7 @@ from sts_jax._checked import in_32_bits
 from sts_jax.mvae import Gaussian
 from sts_jax.statespace import poses, state
 from sts_jax.statespace.networks import FinalPose, Model, compose, experts, fuse, moved, of_state, reduced
-from sts_jax.statespace.predict import drawn_levels, drawn_looks, rendered
+from sts_jax.statespace.predict import drawn_levels, drawn_looks, drawn_noise, rendered
 
 
 class Rollout(NamedTuple):
@@ -173,11 +173,16 @@ def render(
     shown = {name: reduced(x, model.config.image_size) for name, x in empty.items()}
     _, _, appearance, outline = _keys(key, len(belief.mean))
     if appearance is None:
-        looks, level = jnp.broadcast_to(belief.mean[:, state.CODE :], (*pose.shape[:2], model.config.look)), None
+        looks = jnp.broadcast_to(belief.mean[:, state.CODE :], (*pose.shape[:2], model.config.look))
+        level = noise = None
     else:
-        looks, level = drawn_looks(appearance, belief, num), drawn_levels(outline, num)
+        looks = drawn_looks(appearance, belief, num)
+        level, noise = drawn_levels(outline, num), drawn_noise(outline, num)
     layers = rendered(model, belief, looks, pose, turn)
-    pictures = (compose(layers, shown, chosen, shading=model.decoder.shading) for chosen in (level, None))
+    pictures = (
+        compose(layers, shown, chosen, decoder=model.decoder, noise=numbers)
+        for chosen, numbers in [(level, noise), (None, None)]
+    )
     sharp, soft = ({name: x.reshape(*pose.shape[:2], *x.shape[1:]) for name, x in p.items()} for p in pictures)
     return sharp, {name: x.mean(0) for name, x in soft.items()}
 

@@ -550,6 +550,7 @@ def state_model(
         image_size=image_size,
         imprints=True,
         shading=24,
+        outlines=32,
         reflected=scenario.symmetric,
         camera_distance=float(sensor.camera.distance),
         view=float(optics.full_window(sensor.camera, preprocessing.resolution)[2]),
