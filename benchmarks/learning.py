@@ -25,6 +25,7 @@ from benchmarks.instruments.timing import median_seconds
 from sts_jax import mvae, statespace, training
 from sts_jax.mvae import networks
 
+STATE = statespace.Config(imprints=True, shading=24, outlines=32)  # as in experiments
 MODEL = mvae.Config(
     (
         mvae.Modality("visual", "image", (64, 64, 3)),
@@ -107,7 +108,7 @@ def roller(steps: int) -> Callable[[], None]:
 
 def state_stepper(size: int) -> Callable[[], None]:
     """Make a function that runs one training step of a state-space model on random data."""
-    rng, model = np.random.default_rng(0), statespace.Config(imprints=True, shading=24, outlines=32)
+    rng, model = np.random.default_rng(0), STATE
     config = training.TrainConfig(batch_size=size)
 
     def images(count: int, side: int) -> np.ndarray:
@@ -135,7 +136,7 @@ def state_stepper(size: int) -> Callable[[], None]:
 
 def state_predictor(num_samples: int) -> Callable[[], None]:
     """Make a function without arguments that computes one prediction, to measure its duration."""
-    config = statespace.Config()
+    config = STATE
     graphdef, params, _ = statespace.init(jax.random.key(0), config)
     view = training.Preprocessing(resolution=(config.input_size, config.input_size))
     blank = np.full((config.input_size, config.input_size, 3), 128, np.uint8)
