@@ -255,8 +255,9 @@ def bootstrap(
     rng = np.random.default_rng(seed)
     _, member = np.unique(groups, return_inverse=True)
     size = member.max() + 1
-    draws = rng.multinomial(size, np.full(size, 1 / size), size=num)
-    values = np.stack([statistic(draw[member].astype(np.float64)) for draw in draws])
+    # Few groups have few different samples, each of which is computed once.
+    draws, of_sample = np.unique(rng.multinomial(size, np.full(size, 1 / size), size=num), axis=0, return_inverse=True)
+    values = np.stack([statistic(draw[member].astype(np.float64)) for draw in draws])[of_sample.reshape(num)]
     return values if size > 1 else values * np.nan
 
 
