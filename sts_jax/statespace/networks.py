@@ -411,12 +411,10 @@ def init(key: PRNGKeyArray, config: Config) -> tuple[nnx.GraphDef[Model], nnx.St
     """Create a model with random parameters: its definition, its parameters, and an empty state of batch statistics."""
 
     @jax.jit
-    def draw(key: PRNGKeyArray) -> nnx.State:
-        return nnx.state(Model(config, nnx.Rngs(key)), nnx.Param)
+    def draw(key: PRNGKeyArray) -> tuple[nnx.GraphDef[Model], nnx.State, nnx.State]:
+        return nnx.split(Model(config, nnx.Rngs(key)), nnx.Param, ...)
 
-    abstract = nnx.eval_shape(lambda: Model(config, nnx.Rngs(0)))
-    graphdef, _, stats = nnx.split(abstract, nnx.Param, ...)
-    return graphdef, draw(key), stats
+    return draw(key)
 
 
 def experts(

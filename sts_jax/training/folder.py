@@ -17,6 +17,7 @@ resumed training makes them again.
 
 import contextlib
 import dataclasses
+import functools
 import glob
 import hashlib
 import io
@@ -426,7 +427,7 @@ def _load(workdir: Path, calibrated: bool) -> Model:
     try:
         kind = KINDS[settings["kind"]]
         config = storage.decode(kind.Config, settings["model"], "model")
-        graphdef, params, stats = jax.eval_shape(lambda: kind.init(jax.random.key(0), config))
+        graphdef, params, stats = _abstract(kind, config)
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(
             f"{path} does not describe a model that this version of sts_jax can load ({error!r}): train again"
@@ -438,6 +439,12 @@ def _load(workdir: Path, calibrated: bool) -> Model:
         raise storage.DamagedFileError(f"{workdir / CALIBRATION} is that of other inputs: {_remedy(workdir)}.")
     state = nnx.merge_state(weights.params, weights.stats)
     return Model(config, graphdef, state, step, settings, fitted[0] if fitted else None)
+
+
+@functools.cache
+def _abstract(kind: Any, config: Config) -> tuple[nnx.GraphDef[Any], nnx.State, nnx.State]:
+    """The result of `init` without its numbers. To trace it takes half a second."""
+    return jax.eval_shape(lambda: kind.init(jax.random.key(0), config))
 
 
 @in_32_bits
