@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from sts_jax import physics, statespace, training
@@ -15,6 +14,7 @@ from sts_jax._checked import in_32_bits
 from sts_jax.dataset import Dataset, Pairs
 from sts_jax.dataset.measurement import NAMES
 from sts_jax.evaluation.metrics import best_threshold
+from sts_jax.physics.engines import outcome_of
 
 TRUE_STATE = "visual and the true state"  # the true state: pose, shape and mass of the object, from the simulation
 _FELL_OFF = int(physics.Outcome.FELL_OFF)
@@ -62,7 +62,7 @@ def in_unit(image: np.ndarray) -> np.ndarray:
 
 def outcome_of_pose(scenario: physics.Scenario, first: np.ndarray, last: np.ndarray) -> np.ndarray:
     """Determine the outcomes, int `(n,)`, from first poses and true or predicted last poses, `(n, 7)`."""
-    return np.asarray(jax.vmap(scenario.outcome)(jnp.asarray(first), jnp.asarray(last)))
+    return np.asarray(outcome_of(first, last, scenario=scenario))
 
 
 def shares(outcome: np.ndarray, outcomes: Sequence[enum.IntEnum]) -> np.ndarray:

@@ -69,6 +69,14 @@ def velocity_of(condition: Float[Array | np.ndarray, "n c"], scenario: Scenario)
     return jax.vmap(scenario.velocity)(jnp.asarray(condition))
 
 
+@functools.partial(jax.jit, static_argnames="scenario")
+def outcome_of(
+    first: Float[Array | np.ndarray, "n 7"], last: Float[Array | np.ndarray, "n 7"], scenario: Scenario
+) -> Int[Array, "n"]:
+    """`Scenario.outcome` of n trajectories from their first and last poses."""
+    return jax.vmap(scenario.outcome)(jnp.asarray(first), jnp.asarray(last))
+
+
 @jax.jit
 def roll_worlds(worlds: Worlds, model: mjx.Model, data: mjx.Data) -> Rolled:
     """Simulate n trajectories in MJX with the scene of `scene.template`, whose `worlds.fields` are replaced."""

@@ -25,7 +25,7 @@ from sts_jax.physics.arguments import (
     listed,
 )
 from sts_jax.physics.bodies import BodyError, hulls, rigids, shapes
-from sts_jax.physics.engines import Engine, Rolled, Setup, gravity_at, in_c, in_mjx
+from sts_jax.physics.engines import Engine, Rolled, Setup, gravity_at, in_c, in_mjx, outcome_of
 from sts_jax.physics.native import quiet
 from sts_jax.physics.rest import held_wrench
 from sts_jax.physics.roll import SLOW_TIME, Record
@@ -298,7 +298,7 @@ def _trajectory(setup: Setup, sensor: Sensor, accepted: _Accepted) -> Trajectory
     scenario, ends = setup.scenario, jax.tree.map(jnp.asarray, accepted.rolled.ends)
     gravity = gravity_at(accepted.starts.condition, setup.time[:, -1:], scenario=scenario)[:, :, 0]
     record = jax.tree.map(jnp.asarray, _with_held(setup, sensor, accepted, -np.asarray(gravity[:, 0, 2])))
-    outcome = jax.vmap(scenario.outcome)(record.pose[:, 0], record.pose[:, -1])
+    outcome = outcome_of(record.pose[:, 0], record.pose[:, -1], scenario=scenario)
     check_outcomes(scenario, np.asarray(outcome))
     starts = accepted.starts
     return Trajectory(
