@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
 
@@ -62,9 +61,11 @@ def main(config: Config) -> None:
             moving = np.flatnonzero(np.abs(one.velocity).max(1) > STILL)
             last = min(last, int(moving.max(initial=0)) + AFTER)
         pose, wrench, gravity = one.pose[:last], one.wrench[:last], one.gravity[:last]
-        motion, size = (jnp.asarray(pose), jnp.asarray(wrench)), (config.size, config.size)
-        seen = dataset.render_uint8(sensor, body, *motion, resolution=size, crop=False)
-        visual, tactile = (np.asarray(stream) / 255 for stream in seen[:2])
+        # In groups of one size, for which one program is compiled. Copies of the last frame fill the last group.
+        group, size = dataset.frames_per_call(), (config.size, config.size)
+        parts = np.minimum(np.arange(-(-last // group) * group), last - 1).reshape(-1, group)
+        seen = [dataset.render_uint8(sensor, body, pose[k], wrench[k], resolution=size, crop=False)[:2] for k in parts]
+        visual, tactile = (np.concatenate(stream)[:last] / 255 for stream in zip(*seen, strict=True))
         side = max(config.size, SIDE)
         view = drawing.views(body, pose, gravity, sensor, collection.scenario.wall, side)
         words = drawing.describe(collection.scenario, name, one._asdict(), one.hidden._asdict())
