@@ -34,6 +34,9 @@ TINY = statespace.Config(
 STATE = dataclasses.replace(TINY, inputs=statespace.INPUTS, outcomes=3, condition=3, input_size=32)
 
 
+# Without `jit`, JAX would compile 60 programs for each number of items.
+_pose_codes, _state_codes = jax.jit(training.Preprocessing().encode_pose), jax.jit(statespace.encode)
+
 SMALL = mvae.Config((mvae.Modality("a", "vector", (3,)), mvae.Modality("b", "vector", (2,))), latent=4, hidden=8)
 
 
@@ -48,7 +51,7 @@ def random_codes(rng, number):
     """Codes of random poses."""
     quat = rng.normal(size=(number, 4))
     pose = np.concatenate([0.02 * rng.normal(size=(number, 3)), quat / np.linalg.norm(quat, axis=1)[:, None]], axis=1)
-    return training.Preprocessing().encode_pose(jnp.asarray(pose, jnp.float32))
+    return _pose_codes(jnp.asarray(pose, jnp.float32))
 
 
 def random_states(rng, number):
@@ -56,7 +59,7 @@ def random_states(rng, number):
     points = rng.normal(size=(number, 20, 3)) * [0.02, 0.015, 0.01]
     support = np.max(points @ objects.DIRECTIONS.T.astype(np.float64), axis=1)
     solid = support, rng.uniform(0.02, 0.2, number), 0.005 * rng.normal(size=(number, 3))
-    return statespace.encode(random_codes(rng, number), *(jnp.asarray(x, jnp.float32) for x in solid))
+    return _state_codes(random_codes(rng, number), *(jnp.asarray(x, jnp.float32) for x in solid))
 
 
 def trajectories(number):

@@ -1,5 +1,7 @@
 """Calibration of the final pose's density: closed forms, subsets of the inputs, and the file in a model's folder."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -73,15 +75,15 @@ def test_fitted_power_recovers_the_power_of_drawn_outcomes(true):
 def test_each_item_is_corrected_by_the_numbers_of_its_inputs():
     """Items whose masks differ give the same density as if each were alone."""
     given = jax.tree.map(jnp.asarray, trajectories(8))
-    model = statespace.init(jax.random.key(0), STATE)[:2]
+    graphdef, params, _ = statespace.init(jax.random.key(0), STATE)
     present = {name: jnp.arange(8) // 2**i % 2 == 1 for i, name in enumerate(STATE.inputs)}
 
     @jax.jit
-    def run(correction):
-        parts = given["inputs"], present, given["empty"], given["condition"], correction
-        return predict.predict(nnx.merge(*model), *parts)[1]
+    def run(params, given):
+        parts = nnx.merge(graphdef, params), given["inputs"], present, given["empty"], given["condition"]
+        return [predict.predict(*parts, correction)[1] for correction in (None, NUMBERS)]
 
-    plain, found = run(None), run(NUMBERS)
+    plain, found = run(params, given)
     for i in range(8):
         expected = predict.corrected(plain, *(x[i] for x in NUMBERS[:3]))
         for a, b in zip(found, expected, strict=True):
@@ -97,11 +99,12 @@ def test_fitted_contrast_has_the_gradient_energy_of_the_true_images():
     chunks = list(calibration._chunks(given.inputs, given.empty, given.condition, chosen, np.arange(NUMBER)))
     given = jax.tree.map(jnp.asarray, chunks[0])  # a call draws its samples for a whole chunk
     num, key = calibration._SAMPLES, jax.random.split(jax.random.key(0), calibration._CHUNK)
+    sample = jax.jit(functools.partial(predict.sample, graphdef, num=num, drawn=num))
     noise = np.random.default_rng(1).random((NUMBER, STATE.image_size, STATE.image_size, 3))
     noise /= np.sqrt(evaluation.metrics.gradient_energy(noise))[:, None, None, None]
     for contrast in calibration.CONTRASTS:
         numbers = statespace.Calibration(*(jnp.full(8, x) for x in (1.0, 1.0, 1.0, contrast)))
-        drawn = predict.sample(graphdef, params, key, *given, numbers, num=num, drawn=num)
+        drawn = sample(params, key, *given, numbers)
         energy = evaluation.metrics.gradient_energy(np.asarray(drawn.images["visual"][:, :NUMBER])).mean()
         target = np.asarray(noise * np.sqrt(1.002 * energy), np.float32)
         assert calibration._contrast(graphdef, params, chunks, target, np.ones(3)) == contrast
