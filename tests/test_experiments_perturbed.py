@@ -5,6 +5,7 @@ import json
 import shutil
 import types
 
+import jax
 import numpy as np
 import pytest
 from damage import damaged
@@ -63,8 +64,8 @@ def complaints(workdir, top, inputs):
             data.pairs(data.rendered())
             data.views("train")
         elif top == "models":
+            training.records(workdir / "models/statespace")  # first, because it is faster
             sts.Predictor.load(workdir / "models/statespace")
-            training.records(workdir / "models/statespace")
         else:
             return [reason for part in inputs if (reason := evaluate.stale(workdir, part, inputs[part]))]
     except (OSError, ValueError) as error:
@@ -123,14 +124,16 @@ def test_views_and_falls_are_used_in_training(workdir):
 
 def test_a_model_takes_a_jerk_in_si_units(workdir):
     data = dataset.load(workdir / "dataset")
-    pairs = data.pairs(np.array([0]))
+    pairs = data.pairs(data.members("test"))
     predictor = sts.Predictor.load(workdir / "models/statespace")
     assert predictor.preprocessing.condition_scale == physics.Perturbed().condition_scale
-    out = predictor(tactile=pairs.tactile[:, 0] / 255, condition=pairs.condition)
-    other = predictor(tactile=pairs.tactile[:, 0] / 255, condition=pairs.condition * [-1, -1, 1])
+    # As many items and samples as in the evaluation, whose compiled program is used
+    drawn = {"key": jax.random.split(jax.random.key(0), len(pairs.object)), "num_samples": TINY.num_samples}
+    given = {"tactile": pairs.tactile[:, 0] / 255, **drawn}
+    out, other = (predictor(**given, condition=pairs.condition * signs) for signs in (1, [-1, -1, 1]))
     assert np.abs(out.pose - other.pose).max() > 1e-4
-    with pytest.raises(ValueError, match=r"condition has shape None, but .* needs \(1, 3\)"):
-        predictor(tactile=pairs.tactile[:, 0] / 255)
+    with pytest.raises(ValueError, match=r"condition has shape None, but .* needs \(\d, 3\)"):
+        predictor(**given)
 
 
 @pytest.mark.parametrize(("name", "scenario"), [("perturbed", physics.Perturbed), ("inclined", physics.Inclined)])
