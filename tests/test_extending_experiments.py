@@ -1,4 +1,4 @@
-"""Whole experiments with another metric, image size, loss, optimiser, logger and modality, as the pages show."""
+"""Experiments with another metric, image size and modality, as the pages show."""
 
 import dataclasses
 import json
@@ -54,35 +54,6 @@ def test_another_image_size_goes_through_every_stage(tmp_path):
     assert np.isfinite(skills).all()
     assert training.load(tmp_path / "models" / "statespace").config.image_size == 48
     assert dataset.load(tmp_path / "dataset").collection["resolution"] == [96, 96]
-
-
-@pytest.mark.slow
-def test_the_code_of_the_page_runs_an_experiment_with_its_own_parts(tmp_path, capsys):
-    names = {}
-    exec("\n".join(blocks("A whole experiment with your own parts")), names)
-    own, config = names["own"], tiny(freefall.SMOKE, physics.Freefall(frames=15))
-    run.main(config, tmp_path, own=own)
-    logged = [json.loads(line) for line in (tmp_path / "models/statespace/metrics.jsonl").read_text().splitlines()]
-    printed = capsys.readouterr().out
-    for record in logged:
-        assert record["penalty"] > 0
-        assert f"statespace {record['step']} {record['loss']}" in printed
-    assert "farthest (mm)" in (tmp_path / "table.md").read_text()
-    settings = json.loads((tmp_path / "models/statespace/config.json").read_text())
-    assert settings["notes"] == {"optimiser": "AdamW, 1e-3"}
-
-    data = dataset.load(tmp_path / "dataset")
-    ends = data.ends(evaluation.rows_of(data)["test"]).pose
-    copy = np.abs(ends[:, 0, :3] - ends[:, 1, :3]).max(1).mean()
-    assert summary(tmp_path)["copy of the input"]["farthest"]["value"] == pytest.approx(copy, rel=1e-5)
-
-    written = (tmp_path / "metrics.json").stat().st_mtime_ns
-    run.main(config, tmp_path, own=own)
-    assert (tmp_path / "metrics.json").stat().st_mtime_ns == written
-    run.main(config, tmp_path, only="evaluate")  # again, because the list of metrics has changed
-    assert "farthest" not in summary(tmp_path)["copy of the input"]
-    with pytest.raises(ValueError, match=r"loss = 'given as loss='"):
-        run.main(config, tmp_path, only="train")
 
 
 @pytest.mark.long

@@ -1,4 +1,7 @@
-"""The scenarios of `docs/extending.md`, which the library does not contain, from starts to evaluation."""
+"""The scenarios of `docs/extending.md`, which the library does not contain, from starts to evaluation.
+
+The experiment also has its own loss, optimiser, logger, metric and column.
+"""
 
 import dataclasses
 import enum
@@ -11,12 +14,12 @@ import numpy as np
 import pytest
 from extending_page import blocks
 from physics_scenes import solid_block
-from test_extending_experiments import tiny
+from test_extending_experiments import summary, tiny
 
 import sts_jax as sts
 from experiments import perturbed
 from experiments.shared import run
-from sts_jax import physics
+from sts_jax import dataset, evaluation, physics
 
 ENGINES = ["mujoco", pytest.param("mjx", marks=pytest.mark.slow)]
 FRICTION = 0.4
@@ -123,11 +126,36 @@ def test_mistakes_in_a_scenario_are_named(page, changes, match):
 
 
 @pytest.mark.slow
-def test_the_stages_of_an_experiment_train_and_evaluate_a_new_scenario(page, tmp_path):
-    scenario = page["Rolled"](frames=16)
+def test_an_experiment_with_a_new_scenario_and_its_own_parts_goes_through_every_stage(page, tmp_path, capsys):
+    names = {}
+    exec("\n".join(blocks("A whole experiment with your own parts")), names)
+    scenario, own = page["Rolled"](frames=16), names["own"]
     fewer = dataclasses.replace(perturbed.SMOKE.collection, num_objects=10)
-    run.main(tiny(dataclasses.replace(perturbed.SMOKE, collection=fewer), scenario), tmp_path)
-    summary = json.loads((tmp_path / "metrics.json").read_text())
-    assert set(summary["outcomes"]) <= {outcome.name.lower() for outcome in scenario.outcomes}
-    assert sum(summary["outcomes"].values()) == summary["items"]
-    assert any(title.startswith("state-space model") for title in summary["predictors"])
+    config = tiny(dataclasses.replace(perturbed.SMOKE, collection=fewer), scenario)
+    run.main(config, tmp_path, own=own)
+    found = json.loads((tmp_path / "metrics.json").read_text())
+    assert set(found["outcomes"]) <= {outcome.name.lower() for outcome in scenario.outcomes}
+    assert sum(found["outcomes"].values()) == found["items"]
+    assert any(title.startswith("state-space model") for title in found["predictors"])
+
+    logged = [json.loads(line) for line in (tmp_path / "models/statespace/metrics.jsonl").read_text().splitlines()]
+    printed = capsys.readouterr().out
+    for record in logged:
+        assert record["penalty"] > 0
+        assert f"statespace {record['step']} {record['loss']}" in printed
+    assert "farthest (mm)" in (tmp_path / "table.md").read_text()
+    settings = json.loads((tmp_path / "models/statespace/config.json").read_text())
+    assert settings["notes"] == {"optimiser": "AdamW, 1e-3"}
+
+    data = dataset.load(tmp_path / "dataset")
+    ends = data.ends(evaluation.rows_of(data)["test"]).pose
+    copy = np.abs(ends[:, 0, :3] - ends[:, 1, :3]).max(1).mean()
+    assert summary(tmp_path)["copy of the input"]["farthest"]["value"] == pytest.approx(copy, rel=1e-5)
+
+    written = (tmp_path / "metrics.json").stat().st_mtime_ns
+    run.main(config, tmp_path, own=own)
+    assert (tmp_path / "metrics.json").stat().st_mtime_ns == written
+    run.main(config, tmp_path, only="evaluate")  # again, because the list of metrics has changed
+    assert "farthest" not in summary(tmp_path)["copy of the input"]
+    with pytest.raises(ValueError, match=r"loss = 'given as loss='"):
+        run.main(config, tmp_path, only="train")
