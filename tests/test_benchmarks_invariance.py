@@ -1,4 +1,4 @@
-"""All sides of `benchmarks.invariance`, with 128 runs a side and a margin of 15 points instead of 4,000 and 5."""
+"""All sides of `benchmarks.invariance`, with 64 runs a side and a margin of 15 points instead of 4,000 and 5."""
 
 import dataclasses
 
@@ -12,7 +12,7 @@ from sts_jax import physics
 
 pytestmark = pytest.mark.slow
 
-NUM = 128  # four full chunks
+NUM = 64  # two full chunks
 
 
 @pytest.mark.parametrize("index", [1, 2], ids=["bottle", "jerked bottles"])  # the box is dropped as the bottle is
