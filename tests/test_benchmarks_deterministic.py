@@ -3,6 +3,7 @@
 import itertools
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
@@ -13,6 +14,7 @@ from sts_jax import training
 pytestmark = pytest.mark.slow
 
 NUMBER, SIZE = 64, 128
+NETWORK, INITIAL = nnx.split(deterministic.Network(1, 12, 2, nnx.Rngs(0)))
 
 
 @pytest.fixture(scope="module")
@@ -33,20 +35,20 @@ def arrays():
     )
 
 
+@jax.jit
+def run(params, batch):
+    images, numbers = deterministic.features(batch["inputs"], batch["condition"], batch["empty"])
+    return nnx.merge(NETWORK, params)(images, numbers)
+
+
 def test_network_learns_pose_outcome_and_images(arrays, monkeypatch):
     ticks = itertools.count()
+    monkeypatch.setattr(deterministic, "BATCH", 16)
     monkeypatch.setattr(deterministic.time, "perf_counter", lambda: next(ticks))  # each step takes a second
-    network, params = nnx.split(deterministic.Network(1, 12, 2, nnx.Rngs(0)))
-    params, steps = deterministic.fit(arrays, network, params, seconds=150, seed=0)
-    assert 140 < steps < 160
+    params, steps = deterministic.fit(arrays, NETWORK, jax.tree.map(jnp.copy, INITIAL), seconds=90, seed=0)
+    assert 80 < steps < 100
     batch = arrays.take(np.arange(NUMBER))
-
-    @jax.jit
-    def run(batch):
-        images, numbers = deterministic.features(batch["inputs"], batch["condition"], batch["empty"])
-        return nnx.merge(network, params)(images, numbers)
-
-    picture, pose, outcome = run(batch)
+    picture, pose, outcome = run(params, batch)
     truth = batch["targets"]
     assert np.mean(np.argmax(outcome, axis=1) == truth["outcome"]) > 0.9
     assert np.mean((pose - truth["pose"]) ** 2) < 0.3 * np.mean(np.var(truth["pose"], axis=0))
@@ -55,14 +57,8 @@ def test_network_learns_pose_outcome_and_images(arrays, monkeypatch):
 
 
 def test_prediction_does_not_depend_on_other_items_of_the_batch(arrays):
-    network, params = nnx.split(deterministic.Network(1, 12, 2, nnx.Rngs(0)))
-
-    @jax.jit
-    def run(batch):
-        images, numbers = deterministic.features(batch["inputs"], batch["condition"], batch["empty"])
-        return nnx.merge(network, params)(images, numbers)
-
-    some, other = run(arrays.take(np.array([0, 1]))), run(arrays.take(np.array([0, 2])))
+    index = np.arange(NUMBER)  # one shape for both tests
+    some, other = run(INITIAL, arrays.take(index)), run(INITIAL, arrays.take(np.append(0, index[:0:-1])))
     for a, b in zip(some, other, strict=True):
         np.testing.assert_allclose(a[0], b[0], atol=1e-5)
         assert np.abs(np.asarray(a[1]) - np.asarray(b[1])).max() > 1e-4
