@@ -153,7 +153,7 @@ for context in (contextlib.nullcontext(), jax.set_mesh(mesh)):
 
 def test_a_loop_over_a_batch_runs_on_a_mesh_with_explicit_axes():
     """Each device of the mesh loops over its own items."""
-    run(MESH, XLA_FLAGS="--xla_force_host_platform_device_count=2")
+    run(MESH, JAX_NUM_CPU_DEVICES="2")
 
 
 PREDICTION = """
@@ -179,7 +179,7 @@ for leaf, expected in zip(jax.tree.leaves(found), jax.tree.leaves(truth), strict
 
 @pytest.mark.slow
 def test_a_predictor_is_mapped_over_a_mesh_with_explicit_axes():
-    run(PREDICTION, XLA_FLAGS="--xla_force_host_platform_device_count=2")
+    run(PREDICTION, JAX_NUM_CPU_DEVICES="2")
 
 
 CACHE = """
