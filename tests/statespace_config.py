@@ -11,7 +11,7 @@ from scipy import special
 
 import sts_jax as sts
 from sts_jax import mvae, objects, statespace, training
-from sts_jax.statespace import networks, poses
+from sts_jax.statespace import networks, poses, state
 
 TINY = statespace.Config(
     input_size=16,
@@ -60,6 +60,12 @@ def random_states(rng, number):
     support = np.max(points @ objects.DIRECTIONS.T.astype(np.float64), axis=1)
     solid = support, rng.uniform(0.02, 0.2, number), 0.005 * rng.normal(size=(number, 3))
     return _state_codes(random_codes(rng, number), *(jnp.asarray(x, jnp.float32) for x in solid))
+
+
+@jax.jit
+def turned_states(angle, code):
+    """State codes after a rotation of the scene."""
+    return state.join(state.turn(angle, state.split(code)))
 
 
 def trajectories(number):

@@ -59,7 +59,7 @@ def measurement(*lead, seed=0):
     "names", [s for n in (1, 2, 3) for s in itertools.combinations(("visual", "tactile", "pose"), n)]
 )
 def test_any_subset_and_any_leading_axes(predictor, names):
-    lead = ((2, 3), (2,), ())[len(names) - 1]
+    lead = ((), (2,), (2, 3))[len(names) - 1]
     given = {name: value for name, value in measurement(*lead).items() if name in names}
     out = predictor(**given)
     assert out.visual.shape == out.tactile.shape == (*lead, SIDE, SIDE, 3)
@@ -67,9 +67,9 @@ def test_any_subset_and_any_leading_axes(predictor, names):
     assert out.mean.shape == out.log_var.shape == (*lead, 8)
     np.testing.assert_allclose(np.linalg.norm(out.pose[..., 3:], axis=-1), 1, rtol=1e-5)
     assert np.all(out.pose[..., 3] >= 0)
-    if lead:  # a prediction does not depend on the other items
-        alone = predictor(**{name: value[(0,) * len(lead)] for name, value in given.items()})
-        np.testing.assert_allclose(alone.visual, out.visual[(0,) * len(lead)], atol=1e-5)
+    if lead == (2, 3):  # a prediction does not depend on the other items
+        alone = predictor(**{name: value[0, 0] for name, value in given.items()})
+        np.testing.assert_allclose(alone.visual, out.visual[0, 0], atol=1e-5)
 
 
 @pytest.mark.slow

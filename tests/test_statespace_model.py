@@ -9,7 +9,17 @@ import numpy as np
 import pytest
 from flax import nnx
 from scipy import special, stats
-from statespace_config import STATE, finite, random_codes, random_densities, random_states, same, trajectories, unit
+from statespace_config import (
+    STATE,
+    finite,
+    random_codes,
+    random_densities,
+    random_states,
+    same,
+    trajectories,
+    turned_states,
+    unit,
+)
 
 from sts_jax import optics, statespace, storage
 from sts_jax.evaluation import metrics
@@ -18,6 +28,7 @@ from sts_jax.statespace import config, harmonics, networks, objective, poses, st
 
 CONFIG = dataclasses.replace(STATE, drawn=0.5, drawn_first=0.5)
 NUMBER, QUARTER = 4, jnp.array([0.0, 1.0])  # samples of a batch, and a rotation by 90 degrees
+split = jax.jit(state.split)
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +107,7 @@ def test_log_density_is_that_of_a_mixture_in_the_turned_frame():
     final = random_densities(rng, 2, 2, angle)
     code, outcome = random_codes(rng, 2), jnp.array([2, 0])
     since = poses.matrix(random_codes(rng, 2))
-    chance, density = objective.log_density(final, code, since, outcome)
+    chance, density = jax.jit(objective.log_density)(final, code, since, outcome)
     for i, j in enumerate([2, 0]):
         turn = np.eye(3)
         turn[:2, :2] = [[np.cos(angle[i]), np.sin(angle[i])], [-np.sin(angle[i]), np.cos(angle[i])]]
@@ -127,14 +138,16 @@ def test_expert_turns_with_the_image(model, empty):
         (expert.mean, state.turn, harmonics.turn),
         (jnp.exp(expert.log_var), state.turn_variance, harmonics.turn_variance),
     ):
-        known, still, shown = jnp.split(values, [state.CODE, count], axis=1)
-        expected = turn_state(QUARTER[None], state.split(known[:1]))
-        for found, part in zip(state.split(known[1:]), expected, strict=True):
+        known, still, shown = np.split(values, [state.CODE, count], axis=1)
+        expected = jax.jit(turn_state)(QUARTER[None], split(known[:1]))
+        for found, part in zip(split(known[1:]), expected, strict=True):
             np.testing.assert_allclose(found, part, rtol=1e-3, atol=1e-4)
         np.testing.assert_allclose(still[1], still[0], rtol=1e-3, atol=1e-4)
-        np.testing.assert_allclose(shown[1], turn_shown(QUARTER[None], shown[:1, None])[0, 0], rtol=1e-3, atol=1e-4)
-    pose, _, _, _, shown, low = state.split(expert.mean[:, : state.CODE])
-    assert min(float(jnp.abs(x[1] - x[0]).max()) for x in (pose, shown, low)) > 0.01
+        np.testing.assert_allclose(
+            shown[1], jax.jit(turn_shown)(QUARTER[None], shown[:1, None])[0, 0], rtol=1e-3, atol=1e-4
+        )
+    pose, _, _, _, shown, low = split(np.asarray(expert.mean)[:, : state.CODE])
+    assert min(np.abs(np.diff(x, axis=0)).max() for x in (pose, shown, low)) > 0.01
 
 
 def test_final_pose_turns_with_state_and_condition(model):
@@ -154,9 +167,9 @@ def test_final_pose_turns_with_state_and_condition(model):
         return objective.log_density(final, end, since, outcome)
 
     before = density(begin, end, condition)
-    moved = jnp.concatenate([poses.turn(angle, condition[:, :2]), condition[:, 2:]], axis=1)
-    turned = state.join(state.turn(angle, state.split(begin)))
-    after = density(turned, poses.turn_code(angle, end), moved)
+    moved = np.concatenate([jax.jit(poses.turn)(angle, condition[:, :2]), condition[:, 2:]], axis=1)
+    turned = turned_states(angle, begin)
+    after = density(turned, jax.jit(poses.turn_code)(angle, end), moved)
     for a, b in zip(before, after, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4)
     alone = density(turned, end, condition)
@@ -172,16 +185,17 @@ def test_decoder_draws_an_object_at_its_projection(model):
     since = poses.matrix(random_codes(np.random.default_rng(1), 1))[0]
     turns = jnp.stack([since, since, poses.about_vertical(QUARTER) @ since])
     known = jnp.tile(random_states(np.random.default_rng(2), 1), (3, 1))
-    lowest = 1.5 * CONFIG.position_scale - state.reach(state.split(known[:1]), since[None])[0]
+    lowest = 1.5 * CONFIG.position_scale - float(jax.jit(state.reach)(split(known[:1]), since[None])[0])
     assert lowest > 0.01
     step = CONFIG.view / 16 * (CONFIG.camera_distance + lowest) / CONFIG.camera_distance
     there = code.at[:2].set(jnp.array([3 * step, -2 * step]) / CONFIG.position_scale)
     camera = optics.Camera()
-    places = (jnp.stack([code, there])[:, :3] * CONFIG.position_scale).at[:, 2].set(lowest)
-    pixels, _ = optics.to_pixels(camera, optics.full_window(camera, (16, 16)), (16, 16), places)
+    places = np.stack([code, there])[:, :3] * CONFIG.position_scale
+    places[:, 2] = lowest
+    pixels, _ = optics.to_pixels(camera, optics.full_window(camera, (16, 16)), (16, 16), jnp.asarray(places))
     np.testing.assert_allclose(pixels[1] - pixels[0], [3, -2], atol=1e-4)
     grey = {name: jnp.full((16, 16, 3), 0.4) for name in statespace.IMAGES}
-    batch = jnp.stack([code, there, poses.turn_code(QUARTER, code)])
+    batch = jnp.stack([code, there, jax.jit(poses.turn_code)(QUARTER, code)])
     look = jnp.ones((3, CONFIG.look))
 
     @jax.jit
@@ -201,20 +215,19 @@ def test_share_of_levels_that_cover_a_pixel_is_its_probability():
     logit = jnp.tile(jnp.asarray(np.log(chance / (1 - chance)), jnp.float32), (200, 1, 1, 1))
     drawn = networks.Layers(logit, jnp.ones((200, 5, 5, 3)), jnp.zeros((200, 5, 5, 3)))
     empty = {"visual": jnp.zeros((5, 5, 3)), "tactile": jnp.full((5, 5, 3), 0.4)}
-    soft, sharp = (networks.compose(drawn, empty, level) for level in (None, (jnp.arange(200) + 0.5) / 200))
+    compose = jax.jit(networks.compose)
+    soft, sharp = (compose(drawn, empty, level) for level in (None, (jnp.arange(200) + 0.5) / 200))
     np.testing.assert_allclose(soft["visual"][0], np.broadcast_to(chance[0], (5, 5, 3)), atol=1e-5)
     np.testing.assert_allclose(np.mean(sharp["visual"], axis=0), soft["visual"][0], atol=0.02)
     assert np.mean((sharp["visual"] < 0.05) | (sharp["visual"] > 0.95)) > 0.7
     for images in (soft, sharp):
         np.testing.assert_allclose(images["tactile"], 0.4, rtol=1e-5)
     lit = drawn._replace(touch=jnp.full((200, 5, 5, 3), 40.0), pressed=logit)  # an imprint is white
-    soft_touch, sharp_touch = (
-        networks.compose(lit, empty, level)["tactile"] for level in (None, (jnp.arange(200) + 0.5) / 200)
-    )
+    soft_touch, sharp_touch = (compose(lit, empty, level)["tactile"] for level in (None, (jnp.arange(200) + 0.5) / 200))
     np.testing.assert_allclose(soft_touch, 0.4 + 0.6 * soft["visual"], atol=1e-5)
     np.testing.assert_allclose(sharp_touch, 0.4 + 0.6 * sharp["visual"], atol=1e-5)
     level, contrast = jnp.full(200, 0.3), jnp.linspace(1, 9, 200)
-    softer = networks.compose(drawn, empty, level, contrast)["visual"]
+    softer = compose(drawn, empty, level, contrast)["visual"]
     odds = (chance / (1 - chance) / (0.3 / 0.7))[0, None] ** np.asarray(contrast)[:, None, None, None]
     np.testing.assert_allclose(softer, np.broadcast_to(odds / (1 + odds), softer.shape), rtol=1e-3, atol=1e-6)
 
@@ -343,7 +356,7 @@ def test_beliefs_of_falls_are_exact_or_have_noise_of_their_variance():
     number = 400
     code = jnp.tile(random_states(np.random.default_rng(0), 8), (number // 8, 1))
     falls = {"state": code, "pose": code[:, :12], "outcome": jnp.zeros(number, jnp.int32)}
-    ends = objective._known_ends(jax.random.key(0), falls)
+    ends = jax.jit(objective._known_ends)(jax.random.key(0), falls)
     mean, variance = (np.asarray(x, np.float64) for x in (ends.belief.mean, jnp.exp(ends.belief.log_var)))
     np.testing.assert_allclose(mean[:, :12], code[:, :12], atol=1e-3)
     np.testing.assert_allclose(mean[::2], code[::2], atol=1e-3)
@@ -362,7 +375,7 @@ def test_half_of_the_trajectories_are_reflected_with_their_turns_and_jerks(batch
     code, pose = jnp.asarray(batch["targets"]["state"]), jnp.asarray(batch["targets"]["pose"])
     belief = Gaussian(code + 1, jnp.zeros_like(code))
     before = objective._Ends(belief, code, pose, jnp.arange(number), jnp.asarray(batch["condition"]), jnp.ones(number))
-    after = objective._reflected(jax.random.key(0), STATE, before)
+    after = jax.jit(objective._reflected, static_argnums=1)(jax.random.key(0), STATE, before)
     chosen = np.asarray(after.pose[:, 0] != before.pose[:, 0])
     assert 0 < chosen.sum() < number
     turns = [objective.rotation_between(x.state, x.pose) for x in (before, after)]

@@ -11,7 +11,17 @@ import pytest
 from flax import nnx
 from scipy import special, stats
 from scipy.spatial.transform import Rotation
-from statespace_config import STATE, finite, random_codes, random_states, same, trajectories, unit, untrained
+from statespace_config import (
+    STATE,
+    finite,
+    random_codes,
+    random_states,
+    same,
+    trajectories,
+    turned_states,
+    unit,
+    untrained,
+)
 
 from sts_jax import objects, statespace, storage
 from sts_jax.mvae import Gaussian
@@ -46,10 +56,13 @@ def batch():
     return given
 
 
+advanced = jax.jit(poses.advanced)
+
+
 def courses(rng, first, frames=FRAMES):
     codes = [first]
     for _ in range(frames - 1):
-        codes.append(poses.advanced(codes[-1], jnp.asarray(0.2 * rng.normal(size=(len(first), 6)), jnp.float32)))
+        codes.append(advanced(codes[-1], jnp.asarray(0.2 * rng.normal(size=(len(first), 6)), jnp.float32)))
     return jnp.stack(codes, axis=1)
 
 
@@ -71,13 +84,13 @@ def roll(model):
 def test_motions_are_differences_and_rotation_vectors():
     rng = np.random.default_rng(0)
     before, move = random_codes(rng, 20), jnp.asarray(rng.normal(size=(20, 6)), jnp.float32)
-    after = poses.advanced(before, move)
-    np.testing.assert_allclose(poses.motion(before, after), move, atol=1e-5)
+    after, motion = advanced(before, move), jax.jit(poses.motion)
+    np.testing.assert_allclose(motion(before, after), move, atol=1e-5)
     turned = Rotation.from_rotvec(move[:, 3:]) * Rotation.from_matrix(poses.matrix(before))
     np.testing.assert_allclose(poses.matrix(after), turned.as_matrix(), atol=1e-5)
     angle = unit(rng.uniform(-3, 3, 20))
     scene = [poses.turn_code(angle, code) for code in (before, after)]
-    np.testing.assert_allclose(poses.motion(*scene), poses.turn_motion(angle, move), atol=1e-5)
+    np.testing.assert_allclose(motion(*scene), poses.turn_motion(angle, move), atol=1e-5)
     back = poses.turn_motion_back(angle, poses.turn_motion(angle, move))
     np.testing.assert_allclose(back, move, atol=1e-5)
 
@@ -90,7 +103,7 @@ def test_a_moved_state_code_is_that_of_the_moved_object():
     solid = [jnp.asarray(x, jnp.float32) for x in solid]
     before, after = random_codes(rng, 5), random_codes(rng, 5)
     turn = poses.matrix(after) @ poses.matrix(before).swapaxes(1, 2)
-    moved = state.moved(state.split(statespace.encode(before, *solid)), after[:, :3], turn)
+    moved = jax.jit(state.moved)(state.split(statespace.encode(before, *solid)), after[:, :3], turn)
     np.testing.assert_allclose(state.join(moved), statespace.encode(after, *solid), atol=2e-4)
 
 
@@ -98,25 +111,33 @@ def test_variances_of_a_moved_rotation_are_those_of_a_product():
     rng = np.random.default_rng(0)
     variance = jnp.asarray(rng.uniform(0.1, 1, (1, state.CODE)), jnp.float32)
     turn = poses.matrix(random_codes(rng, 1))
-    moved = state.moved_variance(state.split(variance), 0.5, turn).pose[0]
+    moved = jax.jit(state.moved_variance, static_argnums=1)(state.split(variance), 0.5, turn).pose[0]
     dense = np.kron(turn[0], np.eye(3)) @ np.diag(variance[0, 3:12]) @ np.kron(turn[0], np.eye(3)).T
     np.testing.assert_allclose(moved[3:], np.diag(dense), rtol=1e-5)
     np.testing.assert_array_equal(moved[:3], 0.5)
 
 
-def transition(model, code, condition, velocity):
-    belief = Gaussian(code, jnp.full_like(code, -3.0))
-    return nnx.merge(*model).transition(belief, condition, velocity)
+@pytest.fixture(scope="module")
+def transition(model):
+    """The transition of four items with given parameters, compiled once."""
+
+    @jax.jit
+    def run(params, code, condition, velocity):
+        belief = Gaussian(code, jnp.full_like(code, -3.0))
+        return nnx.merge(model[0], params).transition(belief, condition, velocity)
+
+    return run
 
 
-def test_density_of_a_step_is_that_of_a_mixture_about_constant_velocity(model):
+def test_density_of_a_step_is_that_of_a_mixture_about_constant_velocity(model, transition):
     rng = np.random.default_rng(0)
-    code, condition = random_states(rng, 2).at[:, 2].set(3.0), jnp.asarray(rng.normal(size=(2, 3)), jnp.float32)
-    velocity, motion = (jnp.asarray(0.3 * rng.normal(size=(2, 6)), jnp.float32) for _ in range(2))
-    density = jax.jit(functools.partial(transition, model))(code, condition, velocity)
-    numbers = poses.turn_motion_back(density.heading, motion)
-    _, found = objective._log_mixture(density, numbers, jnp.zeros(2, int))
-    for i in range(2):
+    code = random_states(rng, NUMBER).at[:, 2].set(3.0)
+    condition = jnp.asarray(rng.normal(size=(NUMBER, 3)), jnp.float32)
+    velocity, motion = (jnp.asarray(0.3 * rng.normal(size=(NUMBER, 6)), jnp.float32) for _ in range(2))
+    density = transition(model[1], code, condition, velocity)
+    numbers = jax.jit(poses.turn_motion_back)(density.heading, motion)
+    _, found = jax.jit(objective._log_mixture)(density, numbers, jnp.zeros(NUMBER, int))
+    for i in range(NUMBER):
         back = np.kron(np.eye(2), Rotation.from_euler("z", -np.arctan2(*density.heading[i][::-1])).as_matrix())
         parts = [
             float(density.weight[i, 0, k])
@@ -131,7 +152,7 @@ def test_density_of_a_step_is_that_of_a_mixture_about_constant_velocity(model):
         np.testing.assert_array_equal(density.mean[i, 0, -1], 0)  # an object at rest
 
 
-def test_an_object_does_not_sink_into_the_pad(model):
+def test_an_object_does_not_sink_into_the_pad(model, transition):
     """Spheres 2 mm above the pad, 100 mm above, below it and beside it, all with 50 mm per step downwards."""
     radius, position = 0.01, np.array([[0, 0, 0.012], [0, 0, 0.11], [0, 0, -0.03], [0.1, 0, 0.012]])
     place = np.concatenate([position / 0.05, np.tile(np.eye(3).ravel(), (4, 1))], axis=1)
@@ -141,29 +162,28 @@ def test_an_object_does_not_sink_into_the_pad(model):
     for name in ("kernel", "bias"):
         params["transition"]["mixture"][name][...] = 0 * params["transition"]["mixture"][name][...]
     velocity = jnp.zeros((4, 6)).at[:, 2].set(-1.0)
-    density = jax.jit(functools.partial(transition, (model[0], params)))(code, jnp.zeros((4, 3)), velocity)
+    density = transition(params, code, jnp.zeros((4, 3)), velocity)
     for mean, down in zip(density.mean[:, 0, 0], [-0.08, -1.0, -1.0, -1.0], strict=True):  # 2 mm into the pad at most
         np.testing.assert_allclose(mean, [0, 0, down, 0, 0, 0], atol=1e-3)
 
 
-def test_a_step_turns_with_the_scene(model):
+def test_a_step_turns_with_the_scene(model, transition):
     """Exact if the weights of absolute heading, place and condition are zero, as for the final pose."""
     start = 2 * poses.CODE + 7 + 5 + 2 * CONFIG.support
     params = jax.tree.map(lambda x: x, model[1])
     kernel = params["transition"]["first"]["kernel"]
     kernel[...] = kernel[...].at[start : start + 6].set(0)
     rng = np.random.default_rng(0)
-    begin, condition = random_states(rng, 3), jnp.asarray(rng.normal(size=(3, 3)), jnp.float32)
-    velocity = jnp.asarray(rng.normal(size=(3, 6)), jnp.float32)
-    angle = unit([0.4, 2.0, -1.3])
-    run = jax.jit(functools.partial(transition, (model[0], params)))
-    before = run(begin, condition, velocity)
-    moved = jnp.concatenate([poses.turn(angle, condition[:, :2]), condition[:, 2:]], axis=1)
-    turned = state.join(state.turn(angle, state.split(begin)))
-    after = run(turned, moved, poses.turn_motion(angle, velocity))
+    begin, condition = random_states(rng, NUMBER), jnp.asarray(rng.normal(size=(NUMBER, 3)), jnp.float32)
+    velocity = jnp.asarray(rng.normal(size=(NUMBER, 6)), jnp.float32)
+    angle = unit([0.4, 2.0, -1.3, 3.0])
+    before = transition(params, begin, condition, velocity)
+    moved = np.concatenate([jax.jit(poses.turn)(angle, condition[:, :2]), condition[:, 2:]], axis=1)
+    turned = turned_states(angle, begin)
+    after = transition(params, turned, moved, jax.jit(poses.turn_motion)(angle, velocity))
     for a, b in zip(before[:-1], after[:-1], strict=True):
         np.testing.assert_allclose(a, b, atol=2e-4)
-    assert np.abs(before.mean - run(turned, moved, velocity).mean).max() > 0.1
+    assert np.abs(before.mean - transition(params, turned, moved, velocity).mean).max() > 0.1
 
 
 def test_a_rollout_is_the_transition_applied_by_hand(model, batch, roll):
@@ -174,7 +194,7 @@ def test_a_rollout_is_the_transition_applied_by_hand(model, batch, roll):
     solid = support, rng.uniform(0.02, 0.2, NUMBER), 0.005 * rng.normal(size=(NUMBER, 3))
     solid = [jnp.asarray(x, jnp.float32) for x in solid]
     pose, velocity = random_codes(rng, NUMBER).at[:, 2].set(1.0), jnp.zeros((NUMBER, 6))
-    rolled = roll(batch, code=statespace.encode(pose, *solid), steps=4)
+    rolled = roll(batch, code=statespace.encode(pose, *solid))
 
     @jax.jit
     def by_hand(code, condition, velocity):
@@ -183,11 +203,11 @@ def test_a_rollout_is_the_transition_applied_by_hand(model, batch, roll):
         belief = networks.of_state(networks.fuse(networks.experts(net, inputs, one, batch["empty"]), one))
         return net.transition(belief, condition, velocity)
 
-    for i in range(4):
+    for i in range(3):
         density = by_hand(statespace.encode(pose, *solid), batch["condition"][:, i], velocity)
         likeliest = density.mean[jnp.arange(NUMBER), 0, density.weight[:, 0].argmax(-1)]
         velocity = poses.turn_motion(density.heading, likeliest)
-        pose = poses.advanced(pose, velocity)
+        pose = advanced(pose, velocity)
         np.testing.assert_allclose(rolled.pose[i, 0], pose, atol=2e-3)
     assert np.abs(velocity).max() > 0.01
 
@@ -227,11 +247,11 @@ def test_a_sampled_step_is_the_mean_of_a_drawn_component_unless_the_object_rests
 def test_an_object_below_the_pad_keeps_its_pose(batch, roll):
     code = batch["targets"]["state"]
     low = code.at[:2, 2].set(-3.0)
-    rolled = roll(batch, jax.random.key(0), code=low)
+    rolled = roll(batch, jax.random.split(jax.random.key(0), NUMBER), code=low, num=3)
     for i in range(3):
         same(rolled.pose[i, :, :2], rolled.pose[0, :, :2])
-    np.testing.assert_allclose(rolled.pose[0, 0, :2, 2], -3, atol=0.05)
-    assert np.abs(np.diff(rolled.pose[:, 0, 2:], axis=0)).min() > 0
+    np.testing.assert_allclose(rolled.pose[0, :, :2, 2], -3, atol=0.05)
+    assert np.abs(np.diff(rolled.pose[:, :, 2:], axis=0)).min() > 0
 
 
 def test_steps_are_drawn_from_all_frames_with_the_velocity_of_the_course(batch):
@@ -242,13 +262,14 @@ def test_steps_are_drawn_from_all_frames_with_the_velocity_of_the_course(batch):
     ends = objective._Ends(
         Gaussian(code, jnp.full_like(code, -9.2)), code, course, jnp.zeros(number, int), numbered, rows >= 0
     )
-    steps = objective._drawn_steps(jax.random.key(0), dataclasses.replace(CONFIG, stride=stride), ends)
+    draw, motion_of = jax.jit(objective._drawn_steps, static_argnums=1), jax.jit(poses.motion)
+    steps = draw(jax.random.key(0), dataclasses.replace(CONFIG, stride=stride), ends)
     frame = np.asarray(steps.condition[:, 0]).astype(int)
     assert sorted(set(frame.tolist())) == [0, 2, 3, 4]  # frame 1 has no frame two frames before it
     exact = np.asarray((jnp.arange(number) // 2 % 2 == 0) | (frame == 0))
     index, before = np.arange(number), np.maximum(frame - stride, 0)
-    velocity = poses.motion(course[index, before], course[index, frame])
-    motion = poses.motion(course[index, frame], course[index, frame + stride])
+    velocity = motion_of(course[index, before], course[index, frame])
+    motion = motion_of(course[index, frame], course[index, frame + stride])
     np.testing.assert_allclose(steps.velocity[exact], velocity[exact], atol=1e-5)
     np.testing.assert_allclose(steps.motion, motion, atol=1e-5)
     np.testing.assert_allclose(steps.belief.mean[:, :12], course[index, frame], atol=1e-4)
@@ -281,11 +302,14 @@ def test_a_rendered_frame_is_that_of_the_decoder(model, batch, roll):
     images, mean = jax.jit(functools.partial(statespace.render, *model, None))(
         rolled.belief, rolled.pose[1], rolled.turn[1], batch["empty"]
     )
-    net = nnx.merge(*model)
-    known, look = jnp.split(rolled.belief.mean, [state.CODE], axis=1)
-    layers = net.decoder(rolled.pose[1, 0], rolled.turn[1, 0], known, look)
-    empty = {name: networks.reduced(x, CONFIG.image_size) for name, x in batch["empty"].items()}
-    for name, image in networks.compose(layers, empty).items():
+
+    @jax.jit
+    def by_hand(code, pose, turn):
+        layers = nnx.merge(*model).decoder(pose, turn, *jnp.split(code, [state.CODE], axis=1))
+        empty = {name: networks.reduced(x, CONFIG.image_size) for name, x in batch["empty"].items()}
+        return networks.compose(layers, empty)
+
+    for name, image in by_hand(rolled.belief.mean, rolled.pose[1, 0], rolled.turn[1, 0]).items():
         np.testing.assert_allclose(mean[name], image, atol=1e-4)
         np.testing.assert_allclose(images[name][0], image, atol=1e-4)
 

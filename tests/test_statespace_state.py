@@ -15,6 +15,7 @@ NUMBER, DEGREE = 5, 6
 DIRECTIONS = objects.DIRECTIONS.astype(np.float64)
 ANGLES = np.linspace(-2.5, 2.5, NUMBER)
 TURNED = Rotation.from_euler("z", ANGLES[:, None])
+turn, heading = jax.jit(state.turn), jax.jit(state.heading)
 
 
 def expected_basis(direction):
@@ -60,10 +61,13 @@ def fitted(points):
 
 def test_harmonics_and_values_of_turned_functions_equal_scipy():
     places = np.concatenate([sphere(200), np.eye(3, dtype=np.float32), -np.eye(3, dtype=np.float32)])
-    np.testing.assert_allclose(harmonics.basis(jnp.asarray(places), DEGREE), expected_basis(places), atol=2e-5)
+    np.testing.assert_allclose(
+        jax.jit(harmonics.basis, static_argnums=1)(places, DEGREE), expected_basis(places), atol=2e-5
+    )
     coefficients = np.random.default_rng(0).normal(size=(4, 2, harmonics.number(DEGREE))).astype(np.float32)
     rotations = Rotation.random(4, random_state=1)
-    found = harmonics.values(jnp.asarray(coefficients), jnp.asarray(rotations.as_matrix(), jnp.float32), places)
+    run = jax.jit(lambda coefficients, matrix: harmonics.values(coefficients, matrix, places))
+    found = run(coefficients, rotations.as_matrix().astype(np.float32))
     for i in range(4):
         expected = coefficients[i] @ expected_basis(rotations[i].inv().apply(places)).T
         np.testing.assert_allclose(found[i], expected, atol=1e-3)
@@ -82,7 +86,7 @@ def test_shown_shape_is_that_of_the_rotated_vertices():
 def test_reach_is_the_depth_of_the_lowest_vertex():
     points = ellipsoid(2000)
     first, since = (Rotation.random(NUMBER, random_state=seed) for seed in (5, 6))
-    found = state.reach(state.split(encoded(first, points)), jnp.asarray(since.as_matrix(), jnp.float32))
+    found = jax.jit(state.reach)(state.split(encoded(first, points)), since.as_matrix().astype(np.float32))
     expected = [-(rotation.apply(points)[:, 2].min()) for rotation in since * first]
     np.testing.assert_allclose(found, expected, atol=2e-4)
     assert np.ptp(expected) > 1e-3
@@ -92,11 +96,11 @@ def test_turned_state_is_the_state_of_the_turned_pose():
     rotations, place = Rotation.random(NUMBER, random_state=4), [0.3, -0.2, 0.5]
     points, com = 0.02 * np.random.default_rng(0).normal(size=(30, 3)), np.array([0.004, -0.002, 0.007])
     before = state.split(encoded(rotations, points, com, place))
-    after = state.turn(unit(ANGLES), before)
+    after = turn(unit(ANGLES), before)
     expected = state.split(encoded(TURNED * rotations, points, com, TURNED.apply(place)))
     for found, wanted in zip(after, expected, strict=True):
         np.testing.assert_allclose(found, wanted, atol=2e-4)
-    np.testing.assert_allclose(poses.turn_code_back(unit(ANGLES), after.pose), before.pose, atol=1e-5)
+    np.testing.assert_allclose(jax.jit(poses.turn_code_back)(unit(ANGLES), after.pose), before.pose, atol=1e-5)
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -109,18 +113,18 @@ def test_reflected_state_is_the_state_of_the_reflected_object(axis):
     other = Rotation.from_matrix(across[:, None] * rotations.as_matrix() * own)
     expected = encoded(other, points * own, com * own, place * across)
     code = encoded(rotations, points, com, place)
-    found = code * state.reflection(code)
+    found = code * jax.jit(state.reflection)(code)
     np.testing.assert_allclose(found, expected, atol=0.03)  # the directions of a fit are not symmetric
-    assert np.abs(found - encoded(rotations, points, com, place)).max() > 0.3
+    assert np.abs(found - code).max() > 0.3
 
 
 def test_turned_variance_is_the_diagonal_of_the_turned_covariance():
     variance = np.random.default_rng(0).uniform(0.1, 2, state.CODE).astype(np.float32)
     angle = unit([0.7])
     # Turning is linear.
-    turn = state.join(state.turn(jnp.tile(angle, (state.CODE, 1)), state.split(jnp.eye(state.CODE))))
-    expected = np.diag(np.asarray(turn).T @ np.diag(variance) @ np.asarray(turn))
-    found = state.join(state.turn_variance(angle, state.split(jnp.asarray(variance)[None])))[0]
+    turned = np.concatenate(turn(jnp.tile(angle, (state.CODE, 1)), state.split(jnp.eye(state.CODE))), axis=1)
+    expected = np.diag(turned.T @ np.diag(variance) @ turned)
+    found = np.concatenate(jax.jit(state.turn_variance)(angle, state.split(jnp.asarray(variance)[None])), axis=1)[0]
     np.testing.assert_allclose(found, expected, rtol=1e-4)
 
 
@@ -128,15 +132,17 @@ def test_rigid_finds_the_nearest_rotation():
     code = random_codes(np.random.default_rng(0), 5)
     noisy = code.at[:, 3:].multiply(1.7) + 1e-3
     u, _, vt = np.linalg.svd(np.asarray(noisy[:, 3:]).reshape(-1, 3, 3).astype(np.float64))
-    np.testing.assert_allclose(poses.rigid(noisy)[:, 3:].reshape(-1, 3, 3), u @ vt, atol=1e-5)
-    np.testing.assert_array_equal(poses.rigid(noisy)[:, :3], noisy[:, :3])
+    found = np.asarray(jax.jit(poses.rigid)(noisy))
+    np.testing.assert_allclose(found[:, 3:].reshape(-1, 3, 3), u @ vt, atol=1e-5)
+    np.testing.assert_array_equal(found[:, :3], noisy[:, :3])
 
 
 def test_heading_turns_with_the_object():
     rng = np.random.default_rng(1)
     code, angle = random_codes(rng, 200), unit(rng.uniform(-3, 3, 200))
-    expected = poses.turn(angle, poses.heading(code))
-    np.testing.assert_allclose(poses.heading(poses.turn_code(angle, code)), expected, atol=1e-4)
+    found = jax.jit(lambda angle, code: poses.heading(poses.turn_code(angle, code)))(angle, code)
+    expected = jax.jit(lambda angle, code: poses.turn(angle, poses.heading(code)))(angle, code)
+    np.testing.assert_allclose(found, expected, atol=1e-4)
     np.testing.assert_allclose(np.linalg.norm(expected, axis=1), 1, rtol=1e-5)
 
 
@@ -150,27 +156,26 @@ def test_heading_turns_with_the_object():
 )
 def test_heading_is_that_of_the_first_level_axis(rotation, expected):
     code = np.concatenate([np.zeros(3), Rotation.from_rotvec(rotation).as_matrix().ravel()])
-    np.testing.assert_allclose(poses.heading(jnp.asarray(code, jnp.float32)), expected, atol=1e-6)
+    np.testing.assert_allclose(jax.jit(poses.heading)(jnp.asarray(code, jnp.float32)), expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("certainty", [0.0, 0.4])
 def test_heading_of_an_uncertain_rotation_is_the_long_axis_of_the_shown_shape(certainty):
     code = encoded(TURNED, box(0.08, 0.02, 0.03)).at[:, 3:12].multiply(certainty)
-    found = state.heading(state.split(code))
+    found = heading(state.split(code))
     np.testing.assert_allclose(np.abs(np.sum(found * unit(ANGLES), axis=1)), 1, atol=1e-3)  # up to its sign
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, rtol=1e-5)
 
 
 def test_heading_of_a_known_rotation_is_that_of_the_mesh():
     """The long axis of the shape differs and has no influence."""
-    np.testing.assert_allclose(
-        state.heading(state.split(encoded(TURNED, box(0.02, 0.08, 0.03)))), unit(ANGLES), atol=1e-5
-    )
+    np.testing.assert_allclose(heading(state.split(encoded(TURNED, box(0.02, 0.08, 0.03)))), unit(ANGLES), atol=1e-5)
     wild = state.split(random_states(np.random.default_rng(0), 20))
-    np.testing.assert_array_equal(state.heading(wild), poses.heading(wild.pose))
+    np.testing.assert_array_equal(heading(wild), jax.jit(poses.heading)(wild.pose))
 
 
 def test_unknown_state_has_a_unit_heading_and_no_gradient():
+    @jax.jit
     def headings(code):
         return state.heading(state.split(code))
 

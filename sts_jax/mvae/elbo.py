@@ -150,6 +150,7 @@ def loss(
 
 
 @in_32_bits
+@functools.partial(jax.jit, static_argnames="graphdef")
 def infer(
     graphdef: nnx.GraphDef[MVAE],
     state: nnx.State,
@@ -180,10 +181,8 @@ def infer(
     return product_of_experts(*experts, model.prior(condition) if model.config.prior == "conditional" else None)
 
 
-_infer = jax.jit(infer, static_argnums=0)
-
-
 @in_32_bits
+@functools.partial(jax.jit, static_argnames=("graphdef", "batch"))
 def prior(
     graphdef: nnx.GraphDef[MVAE],
     state: nnx.State,
@@ -204,6 +203,7 @@ def prior(
 
 
 @in_32_bits
+@functools.partial(jax.jit, static_argnames="graphdef")
 def decode(
     graphdef: nnx.GraphDef[MVAE],
     state: nnx.State,
@@ -226,6 +226,7 @@ def decode(
 
 
 @in_32_bits
+@functools.partial(jax.jit, static_argnames="graphdef")
 def predict(
     graphdef: nnx.GraphDef[MVAE],
     state: nnx.State,
@@ -283,7 +284,7 @@ def log_evidence(
             f"{list(config.names)}, and num and chunk >= 1"
         )
     _check_condition(config, condition)
-    proposal = _infer(graphdef, state, inputs, present=present, condition=condition)
+    proposal = infer(graphdef, state, inputs, present=present, condition=condition)
     base = prior(graphdef, state, len(proposal.mean), condition=condition)
     # A Python loop, because convolutions in `lax.scan` are slow on a CPU.
     sizes = [min(chunk, num - start) for start in range(0, num, chunk)]

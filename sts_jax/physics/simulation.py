@@ -202,7 +202,7 @@ def simulate(
         hulls=hulls(bodies),
         scenario=scenario,
         pad=(float(sensor.gel.size[0]), float(sensor.gel.size[1])),
-        time=jnp.asarray(frame - np.arange(scenario.steps, 0, -1) * scenario.contact.timestep),
+        time=jax.device_put(frame - np.arange(scenario.steps, 0, -1) * scenario.contact.timestep),
     )
     with quiet(), _reported(progress, len(setup.which), engine) as report:
         accepted = _accepted(key, setup, given, chunk, engine, report)
@@ -265,7 +265,7 @@ def _accepted(
                 f"deeper than {SUNK_LIMIT} m in the pad or the stop wall): check the body's hull and mass, and "
                 "scenario.contact",
             )
-    rolled = jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *(rows[i] for i in range(count)))
+    rolled = jax.tree.map(lambda *x: jax.device_put(np.stack(x)), *(rows[i] for i in range(count)))
     return _Accepted(starts, hidden, rolled, attempt)
 
 
@@ -296,22 +296,23 @@ def _with_held(setup: Setup, sensor: Sensor, accepted: _Accepted, down: Float[np
 def _trajectory(setup: Setup, sensor: Sensor, accepted: _Accepted) -> Trajectory:
     """Collect the results in a `Trajectory`."""
     scenario, ends = setup.scenario, jax.tree.map(jnp.asarray, accepted.rolled.ends)
-    gravity = gravity_at(accepted.starts.condition, setup.time[:, -1:], scenario=scenario)[:, :, 0]
-    record = jax.tree.map(jnp.asarray, _with_held(setup, sensor, accepted, -np.asarray(gravity[:, 0, 2])))
+    gravity = np.asarray(gravity_at(accepted.starts.condition, setup.time[:, -1:], scenario=scenario))[:, :, 0]
+    record = jax.tree.map(jnp.asarray, _with_held(setup, sensor, accepted, -gravity[:, 0, 2]))
     outcome = outcome_of(record.pose[:, 0], record.pose[:, -1], scenario=scenario)
     check_outcomes(scenario, np.asarray(outcome))
-    starts = accepted.starts
+    starts, time = accepted.starts, jnp.arange(scenario.frames) / scenario.rate
+    slow_s = np.asarray(ends.slow, np.float32) * np.float32(scenario.contact.timestep)
     return Trajectory(
-        time=jnp.tile(jnp.arange(scenario.frames) / scenario.rate, (len(setup.which), 1)),
+        time=jnp.asarray(np.tile(time, (len(setup.which), 1))),
         **record._asdict(),
-        gravity=gravity,
-        settled=ends.gone | (ends.slow * scenario.contact.timestep >= SLOW_TIME),
+        gravity=jnp.asarray(gravity),
+        settled=jnp.asarray(np.asarray(ends.gone) | (slow_s >= np.float32(SLOW_TIME))),
         outcome=outcome,
         touches=ends.touches,
         sunk=ends.sunk,
         condition=starts.condition,
         hidden=accepted.hidden,
-        body=jnp.asarray(setup.which, jnp.int32),
+        body=jnp.asarray(setup.which.astype(np.int32)),
         resampled=jnp.asarray(accepted.attempt),
     )
 

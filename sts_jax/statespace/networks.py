@@ -12,6 +12,7 @@ All convolutions have stride 1, for which XLA's CPU backend is fast. To reduce a
 into channels. To enlarge an image, channels are unfolded into blocks of pixels.
 """
 
+import functools
 import math
 from typing import NamedTuple
 
@@ -407,14 +408,10 @@ class Model(nnx.Module):
 
 
 @in_32_bits
+@functools.partial(jax.jit, static_argnames="config")
 def init(key: PRNGKeyArray, config: Config) -> tuple[nnx.GraphDef[Model], nnx.State, nnx.State]:
     """Create a model with random parameters: its definition, its parameters, and an empty state of batch statistics."""
-
-    @jax.jit
-    def draw(key: PRNGKeyArray) -> tuple[nnx.GraphDef[Model], nnx.State, nnx.State]:
-        return nnx.split(Model(config, nnx.Rngs(key)), nnx.Param, ...)
-
-    return draw(key)
+    return nnx.split(Model(config, nnx.Rngs(key)), nnx.Param, ...)
 
 
 def experts(

@@ -57,6 +57,7 @@ def join(state: State) -> Float[Array, "n code"]:
 
 
 @in_32_bits
+@jax.jit
 def encode(
     pose: Float[Array, "n 12"],
     support: Float[Array, "n 128"],

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, UInt8
+from jaxtyping import Array, Bool, Int, UInt8
 
 from sts_jax import mvae, optics, physics, statespace
 from sts_jax._checked import checked, in_32_bits
@@ -204,7 +204,7 @@ def frame_arrays(
         raise ValueError(f"pairs.measurements lacks {lacking}: pass the same `measurements` to Dataset.pairs")
     scales = tuple((m.name, float(m.scale)) for m in measurements if not m.is_image)
     preprocessing = dataclasses.replace(preprocessing, scales=scales)
-    code = np.asarray(_pose_codes(preprocessing, pairs.pose))
+    code = np.asarray(preprocessing.encode_pose(pairs.pose))
     frames = {"visual": pairs.visual, "tactile": pairs.tactile, "pose": code}
     for m in measurements:
         values = pairs.measurements[m.name]
@@ -312,7 +312,7 @@ def step_arrays(
     for group, frames, stored in ((inputs, before, rows[0]), (targets, after, rows[1])):
         for name in modalities:
             if name == "pose":
-                group[name] = np.asarray(_pose_codes(preprocessing, data.trajectory["pose"][trajectory, frames]))
+                group[name] = np.asarray(preprocessing.encode_pose(data.trajectory["pose"][trajectory, frames]))
             else:
                 group[name] = Shared(source, name, stored, (len(stored), *size, 3))
     present = {"tactile": _touched(inputs["tactile"], preprocessing, blank)} if "tactile" in modalities else {}
@@ -409,7 +409,7 @@ def state_arrays(
     """
     if model.stride and pairs.frame is not None and pairs.frame[:, 0].any():
         raise ValueError("the first frames of the pairs are not frame 0, where a one-step model begins: frames=(0, k)")
-    code = np.asarray(_pose_codes(preprocessing, pairs.pose))
+    code = np.asarray(preprocessing.encode_pose(pairs.pose))
     last = reduced_images({"visual": pairs.visual[:, 1], "tactile": pairs.tactile[:, 1]}, model.image_size)
     ends = _ends(pairs, model, scenario, preprocessing, data)
     inputs = {"visual": pairs.visual[:, 0], "tactile": pairs.tactile[:, 0], "pose": code[:, 0]}
@@ -467,7 +467,7 @@ def _ends(
     encoded = np.asarray(preprocessing.encode_condition(jnp.asarray(condition)))
     return {
         "state": state_codes(preprocessing, ends.pose[:, 0], ends.support, ends.mass, ends.com),
-        name: np.asarray(_pose_codes(preprocessing, pose)),
+        name: np.asarray(preprocessing.encode_pose(pose)),
         "outcome": outcome.astype(np.int32),
         **({"condition": encoded} if encoded.shape[-1] else {}),
     }
@@ -485,20 +485,14 @@ def state_codes(
         mass: `(n,)` (kg).
         com: Centres of mass in the mesh frame, `(n, 3)` (m).
     """
-    encode = jax.jit(statespace.encode)
     parts = []
     size = min(_CHUNK, len(pose))
     for start in range(0, len(pose), size):  # bounds the memory
         # The last part is filled up with copies of the last object, because another size would compile anew.
         rows = np.minimum(np.arange(start, start + size), len(pose) - 1)
-        code = _pose_codes(preprocessing, pose[rows])
-        parts.append(np.asarray(encode(code, support[rows], mass[rows], com[rows])))
+        code = preprocessing.encode_pose(pose[rows])
+        parts.append(np.asarray(statespace.encode(code, support[rows], mass[rows], com[rows])))
     return np.concatenate(parts)[: len(pose)]
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _pose_codes(preprocessing: Preprocessing, pose: Float[Array | np.ndarray, "*n 7"]) -> Float[Array, "*n code"]:
-    return preprocessing.encode_pose(jnp.asarray(pose))
 
 
 @in_32_bits

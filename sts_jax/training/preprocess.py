@@ -1,6 +1,7 @@
 """Encoding of images, poses and conditions for the networks, and a contact test for tactile images."""
 
 import dataclasses
+import functools
 from typing import Any, Literal
 
 import jax
@@ -60,6 +61,7 @@ class Preprocessing:
         """Number of values in an encoded pose: 12 with a rotation matrix, 7 with a quaternion."""
         return 3 + {"matrix": 9, "quaternion": 4}[self.rotation]
 
+    @functools.partial(jax.jit, static_argnums=0)
     def encode_pose(self, pose: Float[Array, "*n 7"]) -> Float[Array, "*n code"]:
         """Encode poses for the networks: positions divided by `position_scale`, and rotations.
 
@@ -70,6 +72,7 @@ class Preprocessing:
             quat = geometry.quat_to_matrix(quat).reshape(*quat.shape[:-1], 9)
         return jnp.concatenate([position, quat], axis=-1)
 
+    @functools.partial(jax.jit, static_argnums=0)
     def decode_pose(self, code: Float[Array, "*n code"]) -> Float[Array, "*n 7"]:
         """Decode poses from the output of a network: the inverse of `encode_pose`.
 
