@@ -131,23 +131,27 @@ def ends_in_c(parts: np.ndarray, pose: np.ndarray, rigid: tuple, gravity: np.nda
 ANGLES = np.linspace(0, 2 * np.pi, 8, endpoint=False)
 
 
-@pytest.mark.parametrize(("ends", "low"), [pytest.param(ends_in_mjx, 0.0, marks=pytest.mark.slow), (ends_in_c, 0.01)])
+@pytest.mark.parametrize(
+    ("ends", "low", "angles"),  # a prism and its bases are point-symmetric, so half of the directions are all
+    [pytest.param(ends_in_mjx, 0.0, ANGLES[:4], marks=pytest.mark.slow), (ends_in_c, 0.01, ANGLES)],
+    ids=["mjx", "mujoco"],
+)
 @pytest.mark.parametrize(("sides", "radius"), [(4, 0.015 * np.sqrt(2)), (20, 0.015)])  # a box and a bottle
-def test_a_tall_prism_topples_at_g_b_over_h(sides, radius, ends, low):
+def test_a_tall_prism_topples_at_g_b_over_h(sides, radius, ends, low, angles):
     height, half, mass = 0.1, 0.015, 0.1  # m, kg. The centre of mass is `low` below the middle
     around = (np.arange(sides) + 0.5) * 2 * np.pi / sides
     base = radius * np.c_[np.cos(around), np.sin(around)]
     # It tips over the edge that resists least: half width over the share of the pull across the edge.
-    across = np.cos(ANGLES[:, None] - around - np.pi / sides)
+    across = np.cos(angles[:, None] - around - np.pi / sides)
     reach = radius * np.cos(np.pi / sides) / np.max(across, axis=1)
     inertia = mass / 12 * np.diag([4 * half**2 + height**2, 4 * half**2 + height**2, 8 * half**2])
     rigid = (mass, np.array([0, 0, -low]), inertia, 0.8)
     pose = np.array([0, 0, height / 2, 1, 0, 0, 0])
     for factor, falls in ((0.97, False), (1.03, True)):
         size = factor * G * reach / (height / 2 - low)
-        gravity = np.stack([size * np.cos(ANGLES), size * np.sin(ANGLES), np.full(8, -G)], axis=-1)
+        gravity = np.stack([size * np.cos(angles), size * np.sin(angles), np.full(len(angles), -G)], axis=-1)
         steps = round(0.05 / SCENARIO.contact.timestep)
-        still = np.tile([0, 0, -G], (8, 1, steps, 1))
+        still = np.tile([0, 0, -G], (len(angles), 1, steps, 1))
         pulled = np.tile(gravity[:, None, None], (1, 20, steps, 1))
         pulled[:, :8, :, :2] *= np.linspace(0, 1, 8 * steps).reshape(8, steps, 1)  # sustained, not a blow
         last = ends(prism(base, height), pose, rigid, np.concatenate([still, pulled], axis=1))
