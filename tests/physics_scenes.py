@@ -14,7 +14,6 @@ from sts_jax import objects, physics
 from sts_jax.physics import contact, scene
 
 PAD = (0.15, 0.15)
-RIGID = jax.jit(objects.rigid)
 
 
 def box(*half: float) -> np.ndarray:
@@ -58,7 +57,7 @@ def mjx_model(
 def rigid(bodies: list[objects.Body], trajectory: physics.Trajectory, row: int) -> tuple[float, np.ndarray, np.ndarray]:
     """Mass, centre of mass and inertia of a trajectory's object."""
     hidden = jax.tree.map(lambda x: jnp.asarray(x[row]), trajectory.hidden)
-    mass, com, inertia = RIGID(bodies[trajectory.body[row]], hidden.fill, hidden.shell_scale, hidden.up)
+    mass, com, inertia = objects.rigid(bodies[trajectory.body[row]], hidden.fill, hidden.shell_scale, hidden.up)
     return float(mass), np.asarray(com, np.float64), np.asarray(inertia, np.float64)
 
 

@@ -431,8 +431,7 @@ def test_a_wrong_use_is_named(folder, call, error, message, monkeypatch):
         call(folder)
 
 
-def test_a_folder_of_another_collection_or_another_process_is_refused(copied, monkeypatch):
-    monkeypatch.setattr(storage, "_LOOK_S", 0.1)
+def test_a_folder_of_another_collection_or_another_process_is_refused(copied):
     other = dataclasses.replace(SMALL, scenario=sts.physics.Freefall(frames=12, spread=0.02))
     with pytest.raises(ValueError, match=r"spread = 0\.05, but the current settings have scenario\.spread = 0\.02"):
         dataset.collect(other, sts.Sensor(), copied)

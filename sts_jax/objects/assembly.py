@@ -1,6 +1,6 @@
 """Assembly of a `Body` from a surface, its colours and its masses, in NumPy float64 on the host."""
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 import trimesh
 from jaxtyping import Bool, Float, Int
@@ -65,26 +65,27 @@ def assemble(
         raise ValueError("the mesh `interior` encloses no volume: close it, or turn its faces outwards")
 
     size = size_class(max(len(faces), len(vertices), len(contents)), FACE_CLASSES)
-    single = np.float32
+    single = np.float32  # rounded by NumPy, because JAX would compile a program for each shape
     uv = np.zeros((len(faces), 3, 2)) if uv is None else uv
     texture = np.ones((1, 1, 3)) if texture is None else texture
-    return Body(
-        vertices=jnp.asarray(pad(vertices, size, vertices[-1]), single),
-        faces=jnp.asarray(pad(faces, size, 0.0), np.int32),
-        normals=jnp.asarray(pad(corner_normals(vertices, faces), size, np.array([0.0, 0.0, 1.0])), single),
-        colors=jnp.asarray(pad(colors, size, 0.0), single),
-        uv=jnp.asarray(pad(uv, size, 0.0), single),
-        texture=jnp.asarray(texture, single),
-        two_sided=jnp.asarray(two_sided, bool),
-        hulls=jnp.asarray(pad(hull, size_class(len(hull), HULL_CLASSES), hull[-1])[None], single),
-        shell_mass=jnp.asarray(shell[0], single),
-        shell_com=jnp.asarray(com, single),
-        shell_inertia=jnp.asarray(np.trace(second) * np.eye(3) - second, single),
-        interior=jnp.asarray(pad(contents, size, 0.0), single),
-        contents_density=jnp.asarray(contents_density, single),
-        category=jnp.asarray(category, np.int32),
-        origin=jnp.asarray(-origin, single),
+    arrays = dict(
+        vertices=single(pad(vertices, size, vertices[-1])),
+        faces=pad(faces, size, 0.0).astype(np.int32),
+        normals=single(pad(corner_normals(vertices, faces), size, np.array([0.0, 0.0, 1.0]))),
+        colors=single(pad(colors, size, 0.0)),
+        uv=single(pad(uv, size, 0.0)),
+        texture=single(texture),
+        two_sided=np.asarray(two_sided, bool),
+        hulls=single(pad(hull, size_class(len(hull), HULL_CLASSES), hull[-1])[None]),
+        shell_mass=single(shell[0]),
+        shell_com=single(com),
+        shell_inertia=single(np.trace(second) * np.eye(3) - second),
+        interior=single(pad(contents, size, 0.0)),
+        contents_density=single(contents_density),
+        category=np.int32(category),
+        origin=single(-origin),
     )
+    return Body(**jax.device_put(arrays))
 
 
 def corner_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3 3"]:

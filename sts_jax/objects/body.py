@@ -163,6 +163,7 @@ def mirror(body: Body) -> Body:
 
 
 @in_32_bits
+@jax.jit
 def rigid(
     body: Body, fill: ScalarLike, shell_scale: ScalarLike, up: Direction = (0.0, 0.0, 1.0)
 ) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3 3"]]:

@@ -21,7 +21,6 @@ UPRIGHT = math.radians(1)  # rad, largest lean of a body that counts as upright
 DEEPEST = 0.98  # largest depth of a held object, as a share of the gel's largest depth
 HALVINGS = 50  # bisection steps for the depth
 
-_rigid = jax.jit(objects.rigid)
 _transform = jax.jit(geometry.transform)
 
 
@@ -65,7 +64,7 @@ def stable_faces(
     if is_traced((body, fill, shell_scale, up)):
         raise TypeError("`body`, `fill`, `shell_scale` or `up` is traced: call this outside jit, vmap and grad")
     body.check()
-    com = np.asarray(_rigid(body, fill, shell_scale, np.asarray(up, np.float32))[1], np.float64)
+    com = np.asarray(objects.rigid(body, fill, shell_scale, np.asarray(up, np.float32))[1], np.float64)
     points = np.unique(np.asarray(body.hulls, np.float64).reshape(-1, 3), axis=0)
     if np.linalg.matrix_rank(points - points[:1], tol=1e-6) < 3:
         raise ValueError("the points of the body's hulls span no volume: they are in one plane")
@@ -89,7 +88,7 @@ def weight(
     `shell_scale` and `up` are those of `stable_faces`.
     """
     _check_body(body)
-    mass, com, _ = _rigid(body, fill, shell_scale, jnp.asarray(up, jnp.float32))
+    mass, com, _ = objects.rigid(body, fill, shell_scale, jnp.asarray(up, jnp.float32))
     x, y, _ = _transform(jnp.asarray(pose), com)
     zero = jnp.zeros_like(mass)
     return G * mass * jnp.stack([zero, zero, zero + 1, y, -x, zero])

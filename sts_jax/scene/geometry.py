@@ -7,7 +7,7 @@ a mesh so that its frame is its inertial frame. The compiled pose of its geom un
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
+import jax
 import mujoco
 import numpy as np
 from jaxtyping import Float, Int
@@ -73,24 +73,25 @@ def body_of(model: mujoco.MjModel, geoms: Iterable[int] | Int[np.ndarray, "k"]) 
         colors.append(np.broadcast_to(linear(rgba(model, geom)[:3]), (len(one.faces), 3, 3)))
     uv, texture = _texture(model, geoms, surfaces)
     count, single = size_class(sum(size), FACE_CLASSES), np.float32
-    none = jnp.zeros((), single)
-    return Body(
-        vertices=jnp.asarray(pad(np.concatenate(vertices), count, vertices[-1][-1]), single),
-        faces=jnp.asarray(pad(np.concatenate(faces), count, 0.0), np.int32),
-        normals=jnp.asarray(pad(np.concatenate(normals), count, np.array([0.0, 0.0, 1.0])), single),
-        colors=jnp.asarray(pad(np.concatenate(colors), count, 0.0), single),
-        uv=jnp.asarray(pad(uv, count, 0.0), single),
-        texture=jnp.asarray(texture, single),
-        two_sided=jnp.asarray(False),
-        hulls=jnp.zeros((1, 1, 3), single),
+    none = single(0)
+    arrays = dict(
+        vertices=single(pad(np.concatenate(vertices), count, vertices[-1][-1])),
+        faces=pad(np.concatenate(faces), count, 0.0).astype(np.int32),
+        normals=single(pad(np.concatenate(normals), count, np.array([0.0, 0.0, 1.0]))),
+        colors=single(pad(np.concatenate(colors), count, 0.0)),
+        uv=single(pad(uv, count, 0.0)),
+        texture=single(texture),
+        two_sided=np.bool_(False),
+        hulls=np.zeros((1, 1, 3), single),
         shell_mass=none,
-        shell_com=jnp.zeros(3, single),
-        shell_inertia=jnp.zeros((3, 3), single),
-        interior=jnp.zeros((1, 3, 3), single),
+        shell_com=np.zeros(3, single),
+        shell_inertia=np.zeros((3, 3), single),
+        interior=np.zeros((1, 3, 3), single),
         contents_density=none,
-        category=jnp.asarray(-1, np.int32),
-        origin=jnp.zeros(3, single),
+        category=np.int32(-1),
+        origin=np.zeros(3, single),
     )
+    return Body(**jax.device_put(arrays))
 
 
 def surface(model: mujoco.MjModel, geom: int) -> Surface:
