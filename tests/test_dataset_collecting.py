@@ -86,10 +86,10 @@ def test_trajectories_do_not_depend_on_the_number_of_rendered_ones(folder, spars
 def test_the_true_shape_and_mass_are_those_of_the_body_with_its_hidden_values(folder):
     data = dataset.load(folder)
     pairs, ends = data.pairs(np.arange(8)), data.ends(np.arange(8))
-    bodies, rigid = dataset.make_bodies(SMALL, np.arange(4)), jax.jit(sts.objects.rigid)
+    bodies = dataset.make_bodies(SMALL, np.arange(4))
     for row, number in enumerate(pairs.object):
         hidden = {name: leaf[row] for name, leaf in data.hidden.items()}
-        mass, com, _ = rigid(bodies[number], hidden["fill"], hidden["shell_scale"], hidden["up"])
+        mass, com, _ = sts.objects.rigid(bodies[number], hidden["fill"], hidden["shell_scale"], hidden["up"])
         np.testing.assert_array_equal(pairs.support[row], sts.objects.support(bodies[number]))
         np.testing.assert_allclose(pairs.mass[row], mass, rtol=1e-5)
         np.testing.assert_allclose(pairs.com[row], com, atol=1e-7)
@@ -431,7 +431,8 @@ def test_a_wrong_use_is_named(folder, call, error, message, monkeypatch):
         call(folder)
 
 
-def test_a_folder_of_another_collection_or_another_process_is_refused(copied):
+def test_a_folder_of_another_collection_or_another_process_is_refused(copied, monkeypatch):
+    monkeypatch.setattr(storage, "_LOOK_S", 0.1)
     other = dataclasses.replace(SMALL, scenario=sts.physics.Freefall(frames=12, spread=0.02))
     with pytest.raises(ValueError, match=r"spread = 0\.05, but the current settings have scenario\.spread = 0\.02"):
         dataset.collect(other, sts.Sensor(), copied)

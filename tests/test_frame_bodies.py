@@ -283,12 +283,12 @@ def test_parts_beside_or_far_below_the_face_do_not_hide_what_presses():
     bar = box(0.1, 0.02, 0.01, place=(0.05, 0, 0.005))  # reaches beyond the pad, whose edge is at x = 75 mm
     leg = box(0.01, 0.02, 0.07, place=(0.095, 0, -0.03))
     pressures = [
-        sense(SENSOR, from_trimesh(shape), at(0, 0, -0.001), resolution=(8, 8)).pressure
+        sense(SENSOR, from_trimesh(shape), at(0, 0, -0.001), resolution=SIZE).pressure
         for shape in (bar, trimesh.util.concatenate([bar, leg]))
     ]
     assert np.sum(pressures[0] > 0) > 50
     np.testing.assert_allclose(pressures[1], pressures[0], atol=1)
-    deep = sense(SENSOR, ball(0.005), at(0, 0, -0.003), resolution=(8, 8))  # its centre is below the face
+    deep = sense(SENSOR, ball(0.005), at(0, 0, -0.003), resolution=SIZE)  # its centre is below the face
     cells = np.argwhere(np.asarray(deep.pressure) > 0)
     size = np.array(SENSOR.gel.size)[::-1] / np.array(SENSOR.gel.cells)
     across = np.ptp(cells, axis=0) * size

@@ -259,8 +259,8 @@ def torn(corners):
         (exact(POSES[:6]), 6, r"on_pad must be the index of an image, got 6 .*images: 6"),
         (torn(exact(POSES)), 0, r"exceeds 1 pixels in images 3 \(.* pixels\): leave"),
         (exact([((0.0, 0.0, 0.0), shift) for shift in SHIFTS]), 0, r"by only \d+ degrees.*tilt the board by 20 to 40"),
-        (exact([POSES[0], ((0.7, 0.0, 0.0), (0.0, 0.0, 0.15)), *POSES[2:]]), 1, "image 1 is tilted by 40 and"),
-        (exact([POSES[0], ((0.0, 0.0, 0.7), (0.0, 0.0, 0.15)), *POSES[2:]]), 1, "and turned by -?40 degrees"),
+        (exact([POSES[0], ((0.7, 0.0, 0.0), (0.0, 0.0, 0.15)), *POSES[2:8]]), 1, "image 1 is tilted by 40 and"),
+        (exact([POSES[0], ((0.0, 0.0, 0.7), (0.0, 0.0, 0.15)), *POSES[2:8]]), 1, "and turned by -?40 degrees"),
     ],
 )
 def test_images_that_do_not_determine_the_lens_are_named(corners, on_pad, message):

@@ -185,7 +185,8 @@ FAULTS = ["deaf", "damaged", "lost", "late", "doubled", "garbled", "cut", "joine
 
 
 @pytest.mark.parametrize("first", FAULTS)
-def test_each_request_is_executed_once_whatever_happens_to_its_answer(peer, first):
+def test_each_request_is_executed_once_whatever_happens_to_its_answer(peer, first, monkeypatch):
+    monkeypatch.setattr("sts_jax.hardware.leds.REPEAT_S", 0.03)
     with connect(peer.path) as leds:
         for i, second in enumerate([*FAULTS, "none"]):
             levels = (1 + i, 2, 3, 4)
@@ -386,7 +387,7 @@ def test_lights_are_set_and_acknowledged(controller):
 def test_requests_keep_the_lights_on_and_the_watchdog_turns_them_off_without(controller):
     with connect(controller.path, watchdog_ms=2000) as leds:
         lit = leds.set(ON)
-        time.sleep(3)
+        time.sleep(2.2)
         assert leds.ping().unchanged_since(lit)
         leds._connection.stopped.set()  # no more requests
         leds._thread.join()

@@ -52,10 +52,6 @@ assert len(jax.devices()) == 2
 """
 
 
-def test_importing_leaves_the_backend_of_jax_cold():
-    run(COLD, JAX_PLATFORMS="cpu")
-
-
 def outputs():
     """Results of the library for float64 inputs, by name."""
     key, sensor = jax.random.key(0), sts.Sensor()
@@ -151,9 +147,9 @@ for context in (contextlib.nullcontext(), jax.set_mesh(mesh)):
 """
 
 
-def test_a_loop_over_a_batch_runs_on_a_mesh_with_explicit_axes():
+def test_importing_leaves_the_backend_of_jax_cold_and_a_loop_over_a_batch_runs_on_a_mesh_with_explicit_axes():
     """Each device of the mesh loops over its own items."""
-    run(MESH, JAX_NUM_CPU_DEVICES="2")
+    run(COLD + MESH, JAX_PLATFORMS="cpu")
 
 
 PREDICTION = """
@@ -221,7 +217,7 @@ def test_a_cache_that_cannot_be_written_is_a_warning(place, tmp_path, request, m
     assert ("jax_persistent_cache_min_compile_time_secs", float("inf")) in changed
 
 
-@pytest.mark.parametrize("name", ["run [1]", "lr=[0.1]", "a*b", "what?", "[", "{a}#%41 é"])
+@pytest.mark.parametrize("name", ["lr=[0.1]", "[ a*b what?", "{a}#%41 é"])
 def test_a_folder_may_have_any_name(name, tmp_path):
     config = training.TrainConfig(steps=2, batch_size=8, log_every=1, checkpoint_every=1)
     model = training.train(config, SMALL, arrays(), workdir=tmp_path / name / "model")

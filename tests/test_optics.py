@@ -226,8 +226,10 @@ def test_faces_from_behind_and_with_a_vertex_that_is_not_kept_are_not_drawn():
     order = jnp.repeat(jnp.array([3.0, 2.0, 1.0]), 3).at[8].set(1.5)
     faces = jnp.arange(9).reshape(3, 3)
 
+    draw = jax.jit(lambda keep, two_sided: optics.rasterise(points, order, faces, keep, two_sided, (16, 16)))
+
     def nearest(keep, two_sided=True):
-        return int(optics.rasterise(points, order, faces, keep, jnp.bool_(two_sided), (16, 16))[4, 4])
+        return int(draw(keep, jnp.bool_(two_sided))[4, 4])
 
     keep = jnp.ones(9, bool)
     assert nearest(keep, two_sided=False) == -1

@@ -73,7 +73,7 @@ def test_deepest_contact_is_that_of_c_mujoco_and_there_is_none_where_it_has_none
 
 
 def test_a_flat_base_is_supported_all_round():
-    contacts = contact.collide(hull(points("rod")), jnp.array([0.01, 0.0, -1e-4, 1.0, 0, 0, 0]), HALF)
+    contacts = jax.jit(contact.collide)(hull(points("rod")), jnp.array([0.01, 0.0, -1e-4, 1.0, 0, 0, 0]), HALF)
     touches = np.asarray(contacts.dist) < 0
     used = np.asarray(contacts.pos)[touches] - [0.01, 0, 0]
     np.testing.assert_allclose(np.asarray(contacts.dist)[touches], -1e-4, atol=1e-7)

@@ -54,7 +54,7 @@ def leans(body: objects.Body, pose: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("engine", "num"), [("mujoco", 32), pytest.param("mjx", 3, marks=pytest.mark.slow)], ids=["mujoco", "mjx"]
+    ("engine", "num"), [("mujoco", 16), pytest.param("mjx", 3, marks=pytest.mark.slow)], ids=["mujoco", "mjx"]
 )
 def test_small_and_thin_objects_come_to_rest_on_their_faces(engine, num):
     found = physics.simulate(jax.random.key(1), list(SMALL.values()), Sensor(), DROP, num, engine=engine)

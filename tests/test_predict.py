@@ -35,6 +35,11 @@ def predictor(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
+def traced(predictor):
+    return jax.jit(lambda given: predictor(**given))
+
+
+@pytest.fixture(scope="module")
 def state_predictor(tmp_path_factory):
     path = tmp_path_factory.mktemp("statespace") / "saved"
     state_model().save(path)
@@ -285,11 +290,11 @@ def test_the_gradient_of_a_prediction_equals_finite_differences(predictor):
         ("pose", lambda x: x.at[0, 2].set(jnp.inf)),
     ],
 )
-def test_only_an_invalid_traced_item_gives_nan(predictor, name, change):
+def test_only_an_invalid_traced_item_gives_nan(predictor, traced, name, change):
     given = {key: jnp.asarray(value) for key, value in GIVEN.items()}
     want = predictor(**given)
     wrong = {**given, name: change(given[name])}
-    out = jax.jit(lambda given: predictor(**given))(wrong)
+    out = traced(wrong)
     for leaf, good in zip(jax.tree.leaves(out), jax.tree.leaves(want), strict=True):
         assert np.isnan(leaf[0]).all()
         np.testing.assert_allclose(leaf[1], good[1], atol=1e-5)

@@ -128,7 +128,7 @@ def test_32_bit_heights_in_64_bit_mode_have_the_same_balance():
     height = jnp.asarray(make(*grid()), jnp.float32)
     expected = settle(GEL, height, wrench)
     with jax.enable_x64(True):
-        got = tactile.settle(GEL, height, wrench)
+        got = settle(GEL, height, wrench)
     assert bool(got.balanced)
     np.testing.assert_allclose(got.pressure, expected.pressure, atol=1e-3 * float(expected.pressure.max()))
 

@@ -155,7 +155,8 @@ def test_the_validation_loss_is_that_of_the_predictions_with_the_running_statist
     divergence = np.sum(q.mean**2 + np.exp(q.log_var) - 1 - q.log_var, axis=1) / 2
     monkeypatch.setattr(jax.random, "normal", lambda key, shape: jnp.zeros(shape))
     batch = {"inputs": {"a": x}, "targets": {"a": x}, "present": {}, "target_present": {}, "condition": None}
-    value, (after, _) = training.learner(config).score(graphdef, params, stats, jax.random.key(0), batch, jnp.ones(()))
+    score = jax.jit(training.learner(config).score, static_argnums=0)
+    value, (after, _) = score(graphdef, params, stats, jax.random.key(0), batch, jnp.ones(()))
     np.testing.assert_allclose(value, np.mean(cross + divergence), rtol=1e-5)
     same(after, stats)
 
