@@ -121,10 +121,10 @@ def test_objects_that_are_gone_or_cannot_be_simulated_are_left_out_and_the_other
     np.testing.assert_array_equal(data.trajectory["body"], [0, 2, 3, 5])
     pairs = data.pairs(np.arange(4))
     bodies = dataset.make_bodies(one, data.trajectory["body"])
+    group = (dataset.frames_per_call(), 1)  # copies of one frame, because the collection has compiled this program
     for row, (body, wrench) in enumerate(zip(bodies, data.trajectory["wrench"], strict=True)):
-        shown = dataset.render_uint8(
-            sts.Sensor(), body, pairs.pose[row, :1], wrench[:1], resolution=(64, 64), crop=False
-        )
+        motion = np.tile(pairs.pose[row, :1], group), np.tile(wrench[:1], group)
+        shown = dataset.render_uint8(sts.Sensor(), body, *motion, resolution=(64, 64), crop=False)
         assert np.mean(np.asarray(shown[0][0]) != pairs.visual[row, 0]) < 0.01
 
 
