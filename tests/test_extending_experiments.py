@@ -11,7 +11,7 @@ import sts_jax as sts
 from experiments import freefall, inclined
 from experiments.shared import run
 from experiments.shared.config import Extensions
-from sts_jax import dataset, evaluation, physics, training
+from sts_jax import dataset, evaluation, physics
 
 
 def tiny(smoke, scenario, resolution=(64, 64), **changes):
@@ -42,18 +42,6 @@ def test_the_code_of_the_page_runs(title, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     exec("\n".join(blocks(title)), {"__name__": "page"})
     assert "height error (mm)" in capsys.readouterr().out or title != "Another metric"
-
-
-@pytest.mark.long
-def test_another_image_size_goes_through_every_stage(tmp_path):
-    run.main(tiny(freefall.SMOKE, physics.Freefall(frames=15), (96, 96), image_size=48), tmp_path)
-    predictors = summary(tmp_path)
-    assert predictors["constant (mean training target)"]["visual_skill"]["value"] == 0
-    skills = [row["visual_skill"]["value"] for name, row in predictors.items() if "from visual" in name]
-    assert skills
-    assert np.isfinite(skills).all()
-    assert training.load(tmp_path / "models" / "statespace").config.image_size == 48
-    assert dataset.load(tmp_path / "dataset").collection["resolution"] == [96, 96]
 
 
 @pytest.mark.long
