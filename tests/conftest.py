@@ -13,6 +13,7 @@ Most of the suite's time is compilation. Four settings shorten it:
 """
 
 import atexit
+import ctypes
 import gc
 import importlib.metadata
 import os
@@ -48,6 +49,7 @@ gc.set_threshold(200_000, 20, 100)
 jaxtyping.install_import_hook("sts_jax", "checker.check")
 
 MOST_MAPS = 30_000  # memory maps of a process. Linux allows 65,530, and XLA crashes beyond that
+MOST_PAGES = 500_000  # pages of 4 kB of a process, 2 GB. Otherwise each process grows to 8 GB
 
 
 @pytest.fixture
@@ -59,11 +61,16 @@ def strict_ranks():
 
 @pytest.fixture(autouse=True, scope="module")
 def release_compiled_programs():
-    """Drop all compiled programs before their memory maps reach the limit of the process."""
+    """Drop all compiled programs before they take too many memory maps or too much memory."""
     yield
-    maps = Path("/proc/self/maps")
-    if not maps.exists() or maps.read_bytes().count(b"\n") > MOST_MAPS:
-        jax.clear_caches()
+    maps, pages = Path("/proc/self/maps"), Path("/proc/self/statm")
+    few = maps.exists() and maps.read_bytes().count(b"\n") <= MOST_MAPS
+    if few and int(pages.read_text().split()[1]) <= MOST_PAGES:
+        return
+    jax.clear_caches()
+    gc.collect()
+    if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):  # glibc keeps the memory otherwise
+        trim(0)
 
 
 @pytest.fixture
